@@ -1,0 +1,93 @@
+/// \file
+/// The table of fields: one row a field drives allocation, ghost filling, regridding, output and the docs.
+#pragma once
+
+#include <optional>
+#include <stdexcept>
+#include <string>
+#include <vector>
+
+#include "amr/dim.hpp"
+
+namespace dendrift::amr {
+
+enum class Centring : std::uint8_t { cell, face };
+
+/// What regridding does to the data of a field.
+enum class Transfer : std::uint8_t {
+  none,          ///< not kept: scratch, or recomputed by its module after every change of the mesh
+  conservative,  ///< third-order prolongation that keeps the mean, restriction by the mean
+};
+
+/// Rule for ghost cells beyond a side of the domain that is not periodic.
+struct SideRule {
+  enum class Kind : std::uint8_t { even, value };  ///< even: mirror image, zero normal gradient
+  Kind kind = Kind::even;
+  double value = 0;
+};
+
+/// One row of the table.
+struct FieldSpec {
+  std::string name;    ///< of the array, unique
+  std::string symbol;  ///< as in docs/equations.md
+  std::string unit;    ///< of the stored numbers
+  std::string doc;
+  Centring centring = Centring::cell;
+  Transfer transfer = Transfer::none;
+  bool checkpoint = false;
+  std::array<SideRule, FACES> sides{};
+};
+
+/// Typed handles; a kernel never sees a name or a number.
+struct CellField {
+  int id = -1;
+};
+/// DIM components; component a lives on the faces normal to axis a, index i being the low face of cell i.
+struct FaceField {
+  int id = -1;
+};
+
+/// Rows in the order of declaration. A face field takes DIM consecutive arrays.
+class FieldTable {
+ public:
+  CellField add_cell(FieldSpec spec) {
+    spec.centring = Centring::cell;
+    return {append(std::move(spec))};
+  }
+  FaceField add_face(const FieldSpec& spec) {
+    FaceField f;
+    for (int a = 0; a < DIM; ++a) {
+      FieldSpec component = spec;
+      component.centring = Centring::face;
+      component.name += std::string("_") + "xyz"[a];
+      const int id = append(std::move(component));
+      if (a == 0) f.id = id;
+    }
+    return f;
+  }
+  std::optional<int> find(const std::string& name) const {
+    for (int i = 0; i < size(); ++i)
+      if (row(i).name == name) return i;
+    return std::nullopt;
+  }
+  int size() const { return static_cast<int>(rows_.size()); }
+  const FieldSpec& row(int id) const { return rows_[static_cast<std::size_t>(id)]; }
+
+  /// Cell fields that live through a change of the mesh.
+  std::vector<CellField> transferred() const {
+    std::vector<CellField> out;
+    for (int i = 0; i < size(); ++i)
+      if (row(i).transfer != Transfer::none) out.push_back({i});
+    return out;
+  }
+
+ private:
+  int append(FieldSpec spec) {
+    if (find(spec.name)) throw std::logic_error("field declared twice: " + spec.name);
+    rows_.push_back(std::move(spec));
+    return size() - 1;
+  }
+  std::vector<FieldSpec> rows_;
+};
+
+}  // namespace dendrift::amr

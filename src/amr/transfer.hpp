@@ -1,0 +1,110 @@
+/// \file
+/// Moving cell means between arrays of one or two levels. All boxes are given in cells of the destination.
+#pragma once
+
+#include <cstddef>
+
+#include "amr/loops.hpp"
+#include "amr/mesh.hpp"
+
+namespace dendrift::amr {
+
+/// An array whose cell (0,0[,0]) is at p; x is contiguous.
+template <class T>
+struct ArrayRef {
+  T* p;
+  Array<std::ptrdiff_t> stride;
+
+  T* at(const IntVec& cell) const {
+    std::ptrdiff_t o = 0;
+    for (int a = 0; a < DIM; ++a) o += cell[a] * stride[a];
+    return p + o;
+  }
+};
+
+template <class T>
+ArrayRef<T> array_ref(T* p, const Layout& layout) {
+  ArrayRef<T> r{p, {}};
+  for (int a = 0; a < DIM; ++a) r.stride[a] = layout.stride(a);
+  return r;
+}
+
+/// Densely packed array of the given size.
+template <class T>
+ArrayRef<T> packed_ref(T* p, const IntVec& size) {
+  ArrayRef<T> r{p, {}};
+  std::ptrdiff_t s = 1;
+  for (int a = 0; a < DIM; ++a) {
+    r.stride[a] = s;
+    s *= size[a];
+  }
+  return r;
+}
+
+inline void copy_box(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<const double> src, const IntVec& src_lo,
+                     const IntVec& size) {
+  double* d0 = dst.at(dst_lo);
+  const double* s0 = src.at(src_lo);
+  for_each_row(size, [&](const IntVec& row) {
+    double* d = d0;
+    const double* s = s0;
+    for (int a = 1; a < DIM; ++a) {
+      d += row[a] * dst.stride[a];
+      s += row[a] * src.stride[a];
+    }
+    for (int i = 0; i < size[0]; ++i) d[i] = s[i];
+  });
+}
+
+/// dst cell = mean of its CHILDREN fine cells. `src_lo` is the fine cell that is the first child of dst_lo.
+inline void restrict_box(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<const double> src,
+                         const IntVec& src_lo, const IntVec& size) {
+  double* d0 = dst.at(dst_lo);
+  const double* s0 = src.at(src_lo);
+  const std::ptrdiff_t y = src.stride[1];
+  for_each_row(size, [&](const IntVec& row) {
+    double* d = d0;
+    const double* s = s0;
+    for (int a = 1; a < DIM; ++a) {
+      d += row[a] * dst.stride[a];
+      s += 2 * row[a] * src.stride[a];
+    }
+    for (int i = 0; i < size[0]; ++i, s += 2) {
+      double sum = (s[0] + s[1]) + (s[y] + s[y + 1]);
+      if constexpr (DIM == 3) {
+        const double* t = s + src.stride[2];
+        sum += (t[0] + t[1]) + (t[y] + t[y + 1]);
+      }
+      d[i] = sum / CHILDREN;
+    }
+  });
+}
+
+/// Value of one child from a 3^DIM neighbourhood of means: exact for quadratics, and the children's mean is the
+/// parent's value. c points at the parent, s[a] = -1 or +1 is the child's side along axis a.
+inline double child_value(const double* c, const Array<std::ptrdiff_t>& stride, const Array<double>& s) {
+  double v = *c;
+  for (int a = 0; a < DIM; ++a) v += 0.125 * s[a] * (c[stride[a]] - c[-stride[a]]);
+  for (int a = 0; a < DIM; ++a) {
+    for (int b = a + 1; b < DIM; ++b) {
+      const std::ptrdiff_t p = stride[a] + stride[b], m = stride[a] - stride[b];
+      v += 0.015625 * s[a] * s[b] * ((c[p] + c[-p]) - (c[m] + c[-m]));
+    }
+  }
+  return v;
+}
+
+/// Fills the fine cells of a box from coarse means. `src` counts coarse cells from the one that holds fine cell 0.
+inline void prolong_box(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<const double> src, const IntVec& size) {
+  for_each_cell(dst_lo, size, [&](const IntVec& fine) {
+    IntVec coarse = fine;
+    Array<double> side{};
+    for (int a = 0; a < DIM; ++a) {
+      coarse[a] = fine[a] >> 1;
+      side[a] = (fine[a] & 1) != 0 ? 1.0 : -1.0;
+    }
+    *dst.at(fine) = child_value(src.at(coarse), src.stride, side);
+  });
+}
+
+}  // namespace dendrift::amr

@@ -1,0 +1,71 @@
+/// \file
+/// The program: read, check, run. DIM is fixed at build time; the launcher `dendrift` picks the right program.
+
+#include <fmt/format.h>
+#include <mpi.h>
+
+#include <csignal>
+#include <exception>
+
+#include "command_line.hpp"
+#include "io/hdf5.hpp"
+#include "io/manifest.hpp"
+#include "settings.hpp"
+#include "simulation.hpp"
+
+namespace {
+
+using namespace dendrift;
+
+void on_signal(int) { Simulation::request_stop(); }
+
+int run(const CommandLine& command, bool root) {
+  // 1. What is asked for
+  Settings settings;
+  if (command.keys) {
+    if (root) fmt::print("{}", command.markdown ? settings.schema.keys_markdown() : settings.schema.keys_text());
+    return 0;
+  }
+  settings.parse(command.input, command.overrides);
+
+  // 2. The state: a fresh one, or that of a checkpoint
+  std::optional<std::string> checkpoint;
+  if (!command.restart.empty()) checkpoint = io::find_checkpoint(command.restart);
+  Simulation simulation(settings, MPI_COMM_WORLD, checkpoint);
+  if (command.check) {
+    simulation.print_check();
+    return 0;
+  }
+
+  // 3. The run
+  for (const int s : {SIGTERM, SIGINT, SIGUSR1}) std::signal(s, on_signal);
+  return simulation.run() == Outcome::stopped ? 75 : 0;
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  int provided = 0, rank = 0;
+  MPI_Init_thread(&argc, &argv, MPI_THREAD_FUNNELED, &provided);
+  MPI_Comm_rank(MPI_COMM_WORLD, &rank);
+  int code = 0;
+  const auto fail = [&](int status, const std::string& message) {
+    if (rank == 0 || status == 1) fmt::print(stderr, "dendrift: {}\n", message);
+    code = status;
+  };
+  try {
+    const CommandLine command = parse_command_line(argc, argv, rank == 0);
+    code = command.exit_code ? *command.exit_code : run(command, rank == 0);
+  } catch (const io::InputError& e) {
+    fail(2, e.what());
+  } catch (const NumericalError& e) {
+    fail(3, e.what());
+  } catch (const io::OutputError& e) {
+    fail(4, e.what());
+  } catch (const std::exception& e) {
+    fail(1, fmt::format("rank {}: {}", rank, e.what()));
+    MPI_Abort(MPI_COMM_WORLD, 1);  // one rank alone: the others would wait forever
+  }
+  MPI_Finalize();
+  return code;
+}

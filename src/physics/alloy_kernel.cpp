@@ -1,0 +1,439 @@
+#include "physics/alloy_kernel.hpp"
+
+#include <algorithm>
+#include <vector>
+
+#include "amr/loops.hpp"
+
+namespace dendrift::physics {
+
+namespace {
+
+constexpr int GHOSTS = 2;
+
+// Strides of a block of N cells a side, known to the compiler.
+template <int N>
+struct Shape {
+  static constexpr int P = N + 2 * GHOSTS;
+  static constexpr int SIZE = DIM == 2 ? P * P : P * P * P;
+  static constexpr int Y = P;
+  static constexpr int Z = DIM == 3 ? P * P : 0;
+  static constexpr int ORIGIN = GHOSTS * (1 + Y + Z);
+  static constexpr int stride(int a) { return a == 0 ? 1 : a == 1 ? Y : Z; }
+  static constexpr int index(int i, int j, int k) { return i + j * Y + k * Z; }
+};
+
+// Loop over axes that is gone before the vectoriser looks: f(std::integral_constant<int, 0>), ...
+template <class F>
+[[gnu::always_inline]] inline void each_axis(F&& f) {
+  f(std::integral_constant<int, 0>{});
+  f(std::integral_constant<int, 1>{});
+  if constexpr (DIM == 3) f(std::integral_constant<int, 2>{});
+}
+#define EACH_AXIS(a) each_axis([&](auto a) __attribute__((always_inline)) {
+#define END_AXIS });
+
+// Intermediate results of a block; indexed like the block's arrays, so that one index serves all. Loops run over
+// contiguous memory, ghost columns included: longer vectors are worth more than the few cells wasted.
+template <int N>
+struct Scratch {
+  alignas(64) double e[Shape<N>::SIZE];     // exp(psi / sqrt 2)
+  alignas(64) double t[Shape<N>::SIZE];     // (1 - phi) / 2
+  alignas(64) double u[Shape<N>::SIZE];     // U
+  alignas(64) double rate[Shape<N>::SIZE];  // D_t psi
+  alignas(64) double anti[Shape<N>::SIZE];  // the rate that the antitrapping current sees, if another
+  alignas(64) double flux[DIM][Shape<N>::SIZE];  // through the high face of a cell
+};
+
+template <int N>
+Scratch<N>& scratch() {
+  thread_local std::vector<Scratch<N>> s(1);
+  return s[0];
+}
+
+// (1 - phi)/2 between two cells held at +PSI_MAX, as the kernel computes it: subtracted so that no solute
+// diffuses in bulk solid, exactly.
+double solid_offset() {
+  const double e = fast_exp(PSI_MAX / SQRT2);
+  return 1.0 / (1.0 + e * e);
+}
+
+template <int N>
+void primitives(const double* psi, const double* c, double k, Scratch<N>& s) {
+  using S = Shape<N>;
+  const double scale = 1.0 / SQRT2, rk = 1.0 / (1.0 - k);
+  constexpr int first = S::index(-1, -1, -1), last = S::index(N, N, N);
+  double* e_ = s.e + S::ORIGIN;
+  double* t_ = s.t + S::ORIGIN;
+  double* u_ = s.u + S::ORIGIN;
+#pragma omp simd
+  for (int q = first; q <= last; ++q) {
+    const double e = fast_exp(psi[q] * scale);
+    const double a = 1.0 + e * e, b = 1.0 + k * e * e;
+    const double inverse = 1.0 / (a * b);
+    e_[q] = e;
+    t_[q] = inverse * b;                                // 1/(1+e^2)
+    u_[q] = (c[q] * (inverse * a * a) - 1.0) * rk;      // [1+k-(1-k)phi]/2 = b/a
+  }
+}
+
+// Derivatives of psi at a cell; gradient and Laplacian with isotropic leading errors.
+struct Derivatives {
+  double p[DIM];
+  double m[DIM][DIM];
+  double laplacian;
+};
+
+template <int N>
+[[gnu::always_inline]] inline void derivatives(const double* f, double h, Derivatives& d) {
+  using S = Shape<N>;
+  const double h2 = h * h;
+  double trace = 0, pairs = 0;  // sums of delta_a^2, and of delta_a^2 delta_b^2 over pairs of axes
+  double across[DIM] = {};      // what the other axes add to the gradient
+  EACH_AXIS(a)
+    constexpr int s = S::stride(a);
+    d.m[a][a] = h2 * (f[s] - 2.0 * f[0] + f[-s]);
+    trace += d.m[a][a];
+  END_AXIS
+  EACH_AXIS(a)
+    EACH_AXIS(b)
+      if constexpr (b > a) {
+        constexpr int s = S::stride(a), r = S::stride(b);
+        const double pp = f[s + r], pm = f[s - r], mp = f[-s + r], mm = f[-s - r];
+        d.m[a][b] = d.m[b][a] = 0.25 * h2 * ((pp - pm) - (mp - mm));
+        pairs += ((pp + mm) + (pm + mp)) - 2.0 * ((f[s] + f[-s]) + (f[r] + f[-r])) + 4.0 * f[0];
+        across[a] += ((pp - mm) + (pm - mp)) - 2.0 * (f[s] - f[-s]);
+        across[b] += ((pp - mm) - (pm - mp)) - 2.0 * (f[r] - f[-r]);
+      }
+    END_AXIS
+  END_AXIS
+  EACH_AXIS(a)
+    constexpr int s = S::stride(a);
+    d.p[a] = 0.5 * h * ((f[s] - f[-s]) + across[a] / 6.0);
+  END_AXIS
+  d.laplacian = trace + h2 * (1.0 / 6.0) * pairs;
+}
+
+// The same derivatives along the crystal's axes.
+[[gnu::always_inline]] inline void rotate(const Derivatives& d, const double (&axes)[DIM][DIM], Derivatives& r) {
+  double half[DIM][DIM];
+  EACH_AXIS(i)
+    r.p[i] = 0;
+    EACH_AXIS(a)
+      r.p[i] += axes[i][a] * d.p[a];
+      half[i][a] = 0;
+      EACH_AXIS(b) half[i][a] += axes[i][b] * d.m[b][a]; END_AXIS
+    END_AXIS
+  END_AXIS
+  EACH_AXIS(i)
+    EACH_AXIS(j)
+      r.m[i][j] = 0;
+      EACH_AXIS(a) r.m[i][j] += half[i][a] * axes[j][a]; END_AXIS
+    END_AXIS
+  END_AXIS
+  r.laplacian = d.laplacian;
+}
+
+// Eq. (1) divided by a_s^2 d phi/d psi: with phi = tanh(psi/sqrt 2) and F the homogeneous vector
+// a_s^2 grad psi + |grad psi|^2 a_s d a_s/d(grad psi),
+//   a_s^2 D_t psi = div F + sqrt2 phi (1 - a_s^2 |grad psi|^2) - sqrt2 lambda (1 - phi^2) U.
+// div F is expanded as Hessian of (a_s^2 p^2 / 2) : grad grad psi, all in products of n_i n_j: no trigonometry.
+template <int N, bool Rotated>
+void phase_rate(const double* psi, const AlloyParameters& par, double dx, Scratch<N>& s) {
+  using S = Shape<N>;
+  const double h = 1.0 / dx;
+  const double b = 1.0 - 3.0 * par.epsilon, e4 = 4.0 * par.epsilon;
+  const double drive = SQRT2 * par.lambda;
+  double axes[DIM][DIM];
+  for (int i = 0; i < DIM; ++i)
+    for (int a = 0; a < DIM; ++a) axes[i][a] = par.axes[i][a];
+  const double* t_ = s.t + S::ORIGIN;
+  const double* u_ = s.u + S::ORIGIN;
+  double* rate_ = s.rate + S::ORIGIN;
+  constexpr int first = S::index(-1, -1, -1), last = S::index(N, N, N);
+#pragma omp simd
+  for (int q = first; q <= last; ++q) {
+    Derivatives d;
+    if constexpr (Rotated) {
+      Derivatives lab;
+      derivatives<N>(psi + q, h, lab);
+      rotate(lab, axes, d);
+    } else {
+      derivatives<N>(psi + q, h, d);
+    }
+    double p2 = 1e-12, p4 = 0;
+    EACH_AXIS(i)
+      const double sq = d.p[i] * d.p[i];
+      p2 += sq;
+      p4 += sq * sq;
+    END_AXIS
+    const double m = b * p2 * p2 + e4 * p4;  // a_s |grad psi|^4
+    const double inverse = 1.0 / (p2 * m);
+    const double ip2 = inverse * m;
+    const double ratio = inverse * p2 * p2 * p2;  // 1 / a_s
+    const double a = m * ip2 * ip2;
+    const double sum4 = p4 * ip2 * ip2;  // sum n_i^4
+    double nmn = 0, wmn = 0, wmw = 0, nnm = 0;
+    double g[DIM];
+    EACH_AXIS(i)
+      const double ni2 = d.p[i] * d.p[i] * ip2;
+      g[i] = d.p[i] * (ni2 - sum4);  // |grad psi| (n_i^3 - n_i sum4)
+      nnm += ni2 * d.m[i][i];
+    END_AXIS
+    EACH_AXIS(i)
+      double mp = 0, mg = 0;
+      EACH_AXIS(j)
+        mp += d.m[i][j] * d.p[j];
+        mg += d.m[i][j] * g[j];
+      END_AXIS
+      nmn += d.p[i] * mp;
+      wmn += g[i] * mp;
+      wmw += g[i] * mg;
+    END_AXIS
+    nmn *= ip2;
+    wmn *= ip2;
+    wmw *= ip2;
+    const double div = a * a * d.laplacian + 16.0 * e4 * e4 * wmw +
+                       4.0 * e4 * a * (3.0 * nnm - sum4 * d.laplacian - 2.0 * sum4 * nmn - 4.0 * wmn);
+    const double t = t_[q], phi = 1.0 - 2.0 * t;
+    const double r =
+        ratio * ratio * (div + SQRT2 * phi * (1.0 - a * a * p2) - drive * 4.0 * t * (1.0 - t) * u_[q]);
+    const bool held = (psi[q] >= PSI_MAX && r > 0) || (psi[q] <= -PSI_MAX && r < 0);
+    rate_[q] = held ? 0.0 : r;
+  }
+}
+
+// splitmix64: a counter in, 64 well-mixed bits out; the same on any number of ranks.
+inline std::uint64_t mix(std::uint64_t x) {
+  x += 0x9e3779b97f4a7c15U;
+  x = (x ^ (x >> 30)) * 0xbf58476d1ce4e5b9U;
+  x = (x ^ (x >> 27)) * 0x94d049bb133111ebU;
+  return x ^ (x >> 31);
+}
+
+template <int N>
+void add_noise(const AlloyBlock& blk, const double* psi, Scratch<N>& s) {
+  using S = Shape<N>;
+  double* rate_ = s.rate + S::ORIGIN;
+  amr::for_each_cell(filled(-1), filled(N + 2), [&](const IntVec& cell) {
+    int q = 0;
+    std::uint64_t key = blk.noise_key;
+    for (int a = 0; a < DIM; ++a) {
+      q += cell[a] * S::stride(a);
+      key = mix(key ^ static_cast<std::uint64_t>(blk.first_cell[a] + cell[a]));
+    }
+    if (std::abs(psi[q]) > 4.0) return;
+    rate_[q] += blk.noise * (static_cast<double>(key >> 11) * 0x1p-52 - 1.0);  // uniform in [-1, 1)
+  });
+}
+
+// The printed antitrapping current sees d phi/dt alone: D_t psi - v.grad psi.
+template <int N>
+void subtract_advection(const AlloyBlock& blk, Scratch<N>& s) {
+  using S = Shape<N>;
+  const double h = 0.5 / blk.dx;
+  const double* psi = blk.psi;
+  amr::for_each_cell(filled(-1), filled(N + 2), [&](const IntVec& cell) {
+    int q = 0;
+    for (int a = 0; a < DIM; ++a) q += cell[a] * S::stride(a);
+    double advection = 0;
+    for (int a = 0; a < DIM; ++a) {
+      const int st = S::stride(a);
+      advection += 0.5 * (blk.velocity[a][q] + blk.velocity[a][q + st]) * h * (psi[q + st] - psi[q - st]);
+    }
+    s.anti[S::ORIGIN + q] = s.rate[S::ORIGIN + q] - advection;
+  });
+}
+
+// Eq. (2): flux_c = (1-k) { D (1-phi)/2 grad U + [1+(1-k)U] D_t phi n / (2 sqrt 2) } through the high faces along
+// AXIS. phi at a face is that of the mean psi, which costs one product: exp(psi_face/sqrt2)^2 = e_left e_right.
+template <int N, int AXIS>
+void solute_flux(const double* psi, const double* anti, const AlloyParameters& par, double dx, Scratch<N>& s) {
+  using S = Shape<N>;
+  constexpr int A = S::stride(AXIS);
+  constexpr int first = S::index(AXIS == 0 ? -1 : 0, AXIS == 1 ? -1 : 0, AXIS == 2 ? -1 : 0);
+  constexpr int last = S::index(N - 1, N - 1, N - 1);
+  const double h = 1.0 / dx, k1 = 1.0 - par.k;
+  const double diffusion = k1 * par.diffusivity * h, offset = solid_offset();
+  // D_t phi = sqrt2 (1-phi^2)/2 D_t psi and (1-phi^2) = 4 r (1-r); psi's rate is averaged from two cells.
+  const double trapping = par.antitrapping == Antitrapping::none ? 0.0 : k1 / (2.0 * SQRT2) * 4.0 / SQRT2 * 0.5;
+  const double* e_ = s.e + S::ORIGIN;
+  const double* u_ = s.u + S::ORIGIN;
+  double* flux_ = s.flux[AXIS] + S::ORIGIN;
+#pragma omp simd
+  for (int q = first; q <= last; ++q) {
+    const double dn = psi[q + A] - psi[q];
+    double g2 = dn * dn + 1e-24;
+    EACH_AXIS(b)
+      if constexpr (b != AXIS) {
+        constexpr int B = S::stride(b);
+        const double dt = 0.25 * ((psi[q + B] - psi[q - B]) + (psi[q + A + B] - psi[q + A - B]));
+        g2 += dt * dt;
+      }
+    END_AXIS
+    const double normal = dn * fast_rsqrt(g2);
+    const double r = 1.0 / (1.0 + e_[q] * e_[q + A]);
+    const double enrichment = 1.0 + 0.5 * k1 * (u_[q] + u_[q + A]);
+    flux_[q] = diffusion * (r - offset) * (u_[q + A] - u_[q]) +
+               trapping * r * (1.0 - r) * (anti[q] + anti[q + A]) * enrichment * normal;
+  }
+}
+
+template <int N>
+void update(const AlloyBlock& blk, const Stage& stage, bool phase, const Scratch<N>& s) {
+  using S = Shape<N>;
+  const double w = stage.weight / blk.dx, nu = stage.nu;
+  amr::for_each_row(filled(N), [&](const IntVec& row) {
+    int q0 = 0;
+    for (int a = 1; a < DIM; ++a) q0 += row[a] * S::stride(a);
+    const double* flux[DIM];
+    for (int a = 0; a < DIM; ++a) flux[a] = s.flux[a] + S::ORIGIN + q0;
+    const double* c = blk.c + q0;
+    double* c_next = blk.c_next + q0;
+#pragma omp simd
+    for (int i = 0; i < N; ++i) {
+      double sum = flux[0][i] - flux[0][i - 1];
+      for (int a = 1; a < DIM; ++a) sum += flux[a][i] - flux[a][i - S::stride(a)];
+      c_next[i] = (c[i] + nu * (c_next[i] - c[i])) + w * sum;
+    }
+    if (!phase) return;
+    const double* psi = blk.psi + q0;
+    const double* rate = s.rate + S::ORIGIN + q0;
+    double* psi_next = blk.psi_next + q0;
+#pragma omp simd
+    for (int i = 0; i < N; ++i) {
+      const double p = (psi[i] + nu * (psi_next[i] - psi[i])) + stage.weight * rate[i];
+      psi_next[i] = std::min(std::max(p, -PSI_MAX), PSI_MAX);
+    }
+  });
+}
+
+template <int N>
+void leave_face_fluxes(const AlloyBlock& blk, const Scratch<N>& s) {
+  using S = Shape<N>;
+  for (int face = 0; face < FACES; ++face) {
+    double* out = blk.face_flux[static_cast<std::size_t>(face)];
+    if (out == nullptr) continue;
+    const int axis = face_axis(face);
+    IntVec lo{}, size = filled(N);
+    lo[axis] = face_is_high(face) ? N - 1 : -1;
+    size[axis] = 1;
+    amr::for_each_cell(lo, size, [&](const IntVec& c) {
+      int q = S::ORIGIN;
+      for (int a = 0; a < DIM; ++a) q += c[a] * S::stride(a);
+      *out++ = s.flux[axis][q];
+    });
+  }
+}
+
+template <int N>
+void fill_bulk_phase(const AlloyBlock& blk, double value) {
+  amr::for_each_row(filled(N), [&](const IntVec& row) {
+    int q0 = 0;
+    for (int a = 1; a < DIM; ++a) q0 += row[a] * Shape<N>::stride(a);
+    std::fill_n(blk.psi_next + q0, N, value);
+  });
+}
+
+// Bulk liquid: phi = -1, so (2) is plain diffusion of c. The coefficient is the one that solute_flux finds
+// between two such cells, so that both sides of a face agree.
+template <int N>
+void liquid_fluxes(const AlloyBlock& blk, const AlloyParameters& par, Scratch<N>& s) {
+  using S = Shape<N>;
+  const double e = fast_exp(-PSI_MAX / SQRT2), e2 = e * e;
+  const double coefficient =
+      par.diffusivity * (1.0 / (1.0 + e2) - solid_offset()) * (1.0 + e2) / (1.0 + par.k * e2) / blk.dx;
+  const double* c = blk.c;
+  for (int a = 0; a < DIM; ++a) {
+    const int A = S::stride(a);
+    double* flux = s.flux[a] + S::ORIGIN;
+    const int first = -A, last = S::index(N - 1, N - 1, N - 1);
+#pragma omp simd
+    for (int q = first; q <= last; ++q) flux[q] = coefficient * (c[q + A] - c[q]);
+  }
+}
+
+template <int N>
+void clear_fluxes(Scratch<N>& s) {
+  for (int a = 0; a < DIM; ++a) std::fill_n(s.flux[a], Shape<N>::SIZE, 0.0);
+}
+
+template <int N>
+void rates(const AlloyBlock& blk, const AlloyParameters& par, Scratch<N>& s) {
+  primitives<N>(blk.psi, blk.c, par.k, s);
+  if (par.rotated) {
+    phase_rate<N, true>(blk.psi, par, blk.dx, s);
+  } else {
+    phase_rate<N, false>(blk.psi, par, blk.dx, s);
+  }
+  if (blk.noise > 0) add_noise<N>(blk, blk.psi, s);
+}
+
+template <int N>
+void advance(const AlloyBlock& blk, BlockKind kind, const AlloyParameters& par, const Stage& stage) {
+  Scratch<N>& s = scratch<N>();
+  if (kind == BlockKind::solid) {
+    clear_fluxes<N>(s);
+    fill_bulk_phase<N>(blk, PSI_MAX);
+  } else if (kind == BlockKind::liquid) {
+    liquid_fluxes<N>(blk, par, s);
+    fill_bulk_phase<N>(blk, -PSI_MAX);
+  } else {
+    rates<N>(blk, par, s);
+    const double* anti = s.rate + Shape<N>::ORIGIN;
+    if (par.antitrapping == Antitrapping::eulerian && blk.velocity[0] != nullptr) {
+      subtract_advection<N>(blk, s);
+      anti = s.anti + Shape<N>::ORIGIN;
+    }
+    solute_flux<N, 0>(blk.psi, anti, par, blk.dx, s);
+    solute_flux<N, 1>(blk.psi, anti, par, blk.dx, s);
+    if constexpr (DIM == 3) solute_flux<N, DIM - 1>(blk.psi, anti, par, blk.dx, s);
+  }
+  update<N>(blk, stage, kind == BlockKind::interface, s);
+  leave_face_fluxes<N>(blk, s);
+}
+
+template <int N>
+void interior_rate(const AlloyBlock& blk, const AlloyParameters& par, std::span<double> out) {
+  Scratch<N>& s = scratch<N>();
+  rates<N>(blk, par, s);
+  std::size_t i = 0;
+  amr::for_each_cell({}, filled(N), [&](const IntVec& c) {
+    int q = Shape<N>::ORIGIN;
+    for (int a = 0; a < DIM; ++a) q += c[a] * Shape<N>::stride(a);
+    out[i++] = s.rate[q];
+  });
+}
+
+template <class F>
+void dispatch(int n, F&& f) {
+  if (n == 8) return f(std::integral_constant<int, 8>{});
+  if (n == 16) return f(std::integral_constant<int, 16>{});
+  if (n == 32) return f(std::integral_constant<int, 32>{});
+}
+
+}  // namespace
+
+BlockKind classify(const double* psi, int n) {
+  int size = 1, origin = 0;
+  for (int a = 0; a < DIM; ++a) {
+    origin += GHOSTS * size;
+    size *= n + 2 * GHOSTS;
+  }
+  const double* p = psi - origin;
+  const double bound = p[0];
+  if (bound != PSI_MAX && bound != -PSI_MAX) return BlockKind::interface;
+  for (int q = 0; q < size; ++q)
+    if (p[q] != bound) return BlockKind::interface;
+  return bound > 0 ? BlockKind::solid : BlockKind::liquid;
+}
+
+void advance_alloy(const AlloyBlock& block, BlockKind kind, const AlloyParameters& p, const Stage& stage, int n) {
+  dispatch(n, [&](auto size) { advance<decltype(size)::value>(block, kind, p, stage); });
+}
+
+void psi_rate(const AlloyBlock& block, const AlloyParameters& p, int n, std::span<double> rate) {
+  dispatch(n, [&](auto size) { interior_rate<decltype(size)::value>(block, p, rate); });
+}
+
+}  // namespace dendrift::physics

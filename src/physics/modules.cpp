@@ -1,0 +1,18 @@
+#include "physics/modules.hpp"
+
+#include "physics/flow.hpp"
+#include "physics/solidification.hpp"
+#include "physics/transport.hpp"
+#include "settings.hpp"
+
+namespace dendrift::physics {
+
+Modules make_modules(const Settings& s, const std::vector<Seed>& seeds) {
+  Modules m;
+  if (s.has_flow()) m.push_back(std::make_unique<PrescribedFlow>(s.flow, s.scales));
+  if (s.has_flow()) m.push_back(std::make_unique<Transport>(s.scales.k));
+  m.push_back(std::make_unique<Solidification>(s.phase_field, s.solute, s.scales, seeds));
+  return m;
+}
+
+}  // namespace dendrift::physics

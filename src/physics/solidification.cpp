@@ -1,0 +1,148 @@
+#include "physics/solidification.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include "amr/comm.hpp"
+
+namespace dendrift::physics {
+
+Solidification::Solidification(const PhaseFieldOptions& phase, const SoluteOptions& solute, const Scales& scales,
+                               std::vector<Seed> seeds)
+    : phase_(phase), solute_(solute), scales_(scales), seeds_(std::move(seeds)) {
+  parameters_.k = scales.k;
+  parameters_.lambda = scales.lambda;
+  parameters_.diffusivity = scales.diffusivity;
+  parameters_.epsilon = phase.anisotropy;
+  parameters_.antitrapping = solute.antitrapping;
+  parameters_.axes = seeds_.front().axes;
+  parameters_.rotated = seeds_.front().rotated;
+}
+
+void Solidification::declare(amr::FieldTable& fields) {
+  psi_ = fields.add_cell(psi_field());
+  c_ = fields.add_cell(solute_field());
+  amr::FieldSpec scratch;
+  scratch.doc = "the stage before; scratch";
+  scratch.name = "psi_other";
+  psi_other_ = fields.add_cell(scratch);
+  scratch.name = "c_other";
+  c_other_ = fields.add_cell(scratch);
+}
+
+void Solidification::attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) {
+  mesh_ = &mesh;
+  ghosts_ = &ghosts;
+  fluxes_ = std::make_unique<amr::FluxRegister>(mesh);
+  if (const auto v = mesh.fields().find("velocity_x")) velocity_.id = *v;
+}
+
+void Solidification::initialize() {
+  amr::parallel_for(mesh_->size(), [&](int b) {
+    set_seeds(*mesh_, psi_, seeds_, b);
+    set_uniform_supersaturation(*mesh_, psi_, c_, scales_, b);
+  });
+}
+
+int Solidification::stages(double dt, double dx) const {
+  // Largest eigenvalues: 4 DIM D/dx^2 of the solute's 2 DIM + 1 point Laplacian; for the phase the stiffness
+  // (a_s + a_s'')/a_s across the interface times the isotropic Laplacian's 16/3 (2D) or 8 (3D).
+  const double eps = phase_.anisotropy;
+  const double stiffness = (1 + 15 * eps) / (1 - eps);
+  const double largest = std::max(4.0 * DIM * parameters_.diffusivity, (DIM == 2 ? 16.0 / 3 : 8.0) * stiffness) / (dx * dx);
+  constexpr double SAFETY = 0.9;
+  const double euler_steps = dt * largest / (2 * SAFETY);
+  return std::max(1, static_cast<int>(std::ceil(0.5 * (std::sqrt(1 + 8 * euler_steps) - 1) - 1e-12)));
+}
+
+AlloyBlock Solidification::block_arrays(int b) const {
+  AlloyBlock k;
+  k.psi = mesh_->cells(psi_, b);
+  k.c = mesh_->cells(c_, b);
+  k.psi_next = mesh_->cells(psi_other_, b);
+  k.c_next = mesh_->cells(c_other_, b);
+  k.dx = mesh_->block(b).dx;
+  for (int a = 0; a < DIM; ++a) {
+    k.first_cell[a] = std::int64_t{mesh_->block(b).index.coord[a]} * mesh_->layout().n;
+    if (velocity_.id >= 0) k.velocity[static_cast<std::size_t>(a)] = mesh_->faces(velocity_, a, b);
+  }
+  return k;
+}
+
+void Solidification::run_stage(const Stage& stage, double noise, std::uint64_t noise_key, bool measure) {
+  const amr::Layout& layout = mesh_->layout();
+  if (measure) block_cost_.resize(static_cast<std::size_t>(mesh_->size()));
+  ghosts_->fill_and_run({psi_, c_}, [&](int b) {
+    const double begin = measure ? MPI_Wtime() : 0;
+    AlloyBlock k = block_arrays(b);
+    for (int f = 0; f < FACES; ++f) k.face_flux[static_cast<std::size_t>(f)] = fluxes_->store(b, f);
+    k.noise = noise;
+    k.noise_key = noise_key + static_cast<std::uint64_t>(mesh_->block(b).index.level);
+    const BlockKind kind = classify(k.psi, layout.n);
+    advance_alloy(k, kind, parameters_, stage, layout.n);
+    if (measure) block_cost_[static_cast<std::size_t>(b)] = {MPI_Wtime() - begin, static_cast<double>(kind)};
+  });
+  // What the fine side of a face lets through is what the coarse side receives.
+  fluxes_->correct(c_other_, stage.weight);
+  mesh_->swap(psi_, psi_other_);
+  mesh_->swap(c_, c_other_);
+}
+
+void Solidification::advance(double, double dt, std::int64_t step) {
+  if (phase_.frozen) return;
+  const double dx = mesh_->shape().dx(mesh_->shape().max_level);
+  const int s = stages(dt, dx);
+  const double w = 2.0 / (s * s + s) * dt;
+  double noise = 0;
+  std::uint64_t key = 0;
+  if (phase_.noise > 0) {
+    noise = phase_.noise / std::sqrt(dt * std::pow(dx, DIM));
+    key = (static_cast<std::uint64_t>(phase_.noise_seed) << 40) + (static_cast<std::uint64_t>(step) << 6);
+  }
+  fluxes_->prepare();
+  run_stage({0, w}, noise, key, true);
+  for (int j = 2; j <= s; ++j)
+    run_stage({(1.0 - j) / j, (2.0 * j - 1) / j * w}, noise, key, false);
+}
+
+void Solidification::before_tagging() {
+  // Mean time of a stage by kind of block, over all ranks, so that everybody weighs blocks alike.
+  std::array<double, 6> sums{};
+  for (const auto& [seconds, kind] : block_cost_) {
+    sums[static_cast<std::size_t>(kind)] += seconds;
+    sums[static_cast<std::size_t>(kind) + 3] += 1;
+  }
+  MPI_Allreduce(MPI_IN_PLACE, sums.data(), 6, MPI_DOUBLE, MPI_SUM, mesh_->comm());
+  for (std::size_t i = 0; i < 3; ++i)
+    if (sums[i] > 0) kind_cost_[i] = sums[i] / sums[i + 3];
+}
+
+void Solidification::tag(int b, amr::Tag& tag) const {
+  tag_interface(*mesh_, psi_, phase_, b, tag);
+  tag_solute(*mesh_, psi_, c_, scales_, solute_, b, tag);
+  if (initializing_) tag_seeds(*mesh_, seeds_, phase_.band(), b, tag);
+  tag.weight = kind_cost_[static_cast<std::size_t>(classify(mesh_->cells(psi_, b), mesh_->layout().n))];
+}
+
+double Solidification::front_speed() const {
+  if (phase_.frozen) return 0;
+  const int n = mesh_->layout().n;
+  const double band = phase_.band();
+  std::vector<double> fastest(static_cast<std::size_t>(mesh_->size()), 0.0);
+  amr::parallel_for(mesh_->size(), [&](int b) {
+    const AlloyBlock k = block_arrays(b);
+    if (classify(k.psi, n) != BlockKind::interface) return;
+    thread_local std::vector<double> rate;
+    rate.resize(static_cast<std::size_t>(volume(filled(n))));
+    psi_rate(k, parameters_, n, rate);
+    const double* r = rate.data();
+    double& v = fastest[static_cast<std::size_t>(b)];
+    amr::for_each_cell({}, filled(n), [&](const IntVec& c) {
+      if (std::abs(k.psi[mesh_->layout().offset(c)]) < band) v = std::max(v, std::abs(*r));
+      ++r;
+    });
+  });
+  return amr::global_max(fastest.empty() ? 0 : *std::max_element(fastest.begin(), fastest.end()), mesh_->comm());
+}
+
+}  // namespace dendrift::physics

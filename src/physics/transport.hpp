@@ -1,0 +1,40 @@
+/// \file
+/// The flow carries phase and solute: v.grad phi of eq. (1) and div(v c) of eq. (2).
+#pragma once
+
+#include "amr/flux_register.hpp"
+#include "physics/alloy_kernel.hpp"
+#include "physics/module.hpp"
+
+namespace dendrift::physics {
+
+/// psi, smooth across the interface, is carried along characteristics by cubic interpolation. c moves by fluxes, so
+/// that no solute is lost: flux = v A(phi_f) [1+(1-k) U_f], A = [1+k-(1-k)phi]/2, with phi_f taken from psi at the
+/// middle of the step and corrected to fourth order, so that c follows phi and a uniform U stays uniform.
+/// Reads the face field "velocity" and the cell fields psi and c.
+class Transport : public Module {
+ public:
+  explicit Transport(double partition_coefficient) : k_(partition_coefficient) {}
+  const char* name() const override { return "transport"; }
+  void attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) override;
+  void initialize() override { after_regrid(); }
+  void after_regrid() override;
+  double max_dt() const override;
+  void advance(double t, double dt, std::int64_t step) override;
+  double front_speed() const override { return fastest_; }
+
+ private:
+  void carry_phase(int b, double dt) const;
+  void carry_solute(int b, double dt);
+
+  double k_;
+  amr::CellField psi_, c_, psi_other_, c_other_;
+  amr::FaceField v_;
+  amr::Mesh* mesh_ = nullptr;
+  amr::GhostExchange* ghosts_ = nullptr;
+  std::unique_ptr<amr::FluxRegister> fluxes_;
+  double fastest_ = 0;       // largest |v|
+  double largest_rate_ = 0;  // largest sum over axes of |v_a|/dx, 1/tau0
+};
+
+}  // namespace dendrift::physics

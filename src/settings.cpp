@@ -1,0 +1,180 @@
+#include "settings.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <stdexcept>
+
+namespace dendrift {
+
+void RunOptions::declare(io::Schema& schema) {
+  io::Table& t = schema.table("run", "how long", io::Schema::Presence::required);
+  t.text("title", title).doc("for the reader; goes into manifest.json");
+  t.real("end_time_s", end_time_s).unit("s").at_least(0).doc("simulated time at which the run ends; or end_time_tau0");
+  t.real("end_time_tau0", end_time_tau0).unit("tau0").at_least(0).doc("the same in units of tau0");
+  t.integer("max_steps", max_steps).at_least(0).doc("time steps after which the run ends at the latest");
+  t.real("wall_clock_limit_s", wall_clock_limit_s)
+      .unit("s")
+      .at_least(0)
+      .doc("running time after which a checkpoint is written and the program ends with exit code 75; 0: none");
+  schema.check({"run"}, [this](io::Checks& c) {
+    if (c.given("run.end_time_s") == c.given("run.end_time_tau0"))
+      c.fail("run", "exactly one of end_time_s and end_time_tau0", end_time_s ? "both" : "neither");
+  });
+}
+
+void MeshOptions::declare(io::Schema& schema) {
+  io::Table& t = schema.table("mesh", "box and blocks", io::Schema::Presence::required);
+  t.integer("dim", dim).range(2, 3).required().doc("space dimensions");
+  t.reals("size_um", size_um).unit("um").above(0).doc("sides of the box; or size_W0");
+  t.reals("size_W0", size_w0).unit("W0").above(0).doc("sides of the box");
+  t.real("dx_W0", dx_w0).unit("W0").range(0.05, 4).doc("upper limit of the finest cell spacing");
+  t.integer("block_cells", block_cells).range(8, 32).doc("cells along a side of a block: 8, 16 or 32");
+  t.integers("root_blocks", root_blocks).at_least(1).doc("blocks of the coarsest level along each axis, instead of dx_W0");
+  t.integer("levels", levels).range(1, 16).doc("levels of refinement, with root_blocks; 1 is a uniform mesh");
+  using amr::Side;
+  const std::vector<std::pair<std::string, Side>> cases{
+      {"wall", Side::wall}, {"symmetry", Side::symmetry}, {"open", Side::open}, {"periodic", Side::periodic}};
+  const char* names[] = {"xlo", "xhi", "ylo", "yhi", "zlo", "zhi"};
+  for (std::size_t f = 0; f < FACES; ++f) t.choice(names[f], sides[f], cases).doc("side of the box");
+  t.integer("max_regrid_steps", max_regrid_steps).range(1, 1000).doc("steps between changes of the mesh at most");
+  schema.check({"mesh"}, [this](io::Checks& c) {
+    if (dim != DIM) return;  // the launcher picks the program; nothing else can be right in the wrong one
+    if (size_um.has_value() == size_w0.has_value())
+      c.fail("mesh", "exactly one of size_um and size_W0", size_um ? "both" : "neither");
+    if (block_cells != 8 && block_cells != 16 && block_cells != 32) c.fail("mesh.block_cells", "8, 16 or 32");
+    if (root_blocks.has_value() != levels.has_value())
+      c.fail("mesh", "root_blocks and levels together, or neither", root_blocks ? "root_blocks alone" : "levels alone");
+    const char* lo_hi[] = {"xlo", "xhi", "ylo", "yhi", "zlo", "zhi"};
+    for (std::size_t f = 0; f < FACES; f += 2)
+      if ((sides[f] == amr::Side::periodic) != (sides[f + 1] == amr::Side::periodic))
+        c.fail(std::string("mesh.") + lo_hi[sides[f] == amr::Side::periodic ? f : f + 1],
+               "opposite sides both periodic, or neither");
+  });
+}
+
+void ParallelOptions::declare(io::Schema& schema) {
+  io::Table& t = schema.table("parallel", "distribution over ranks; never changes results", io::Schema::Presence::implied);
+  t.choice("partitioner", partitioner, {{"curve", amr::Partitioner::curve}, {"graph", amr::Partitioner::graph}})
+      .doc("weighted Morton curve, or METIS on the graph of blocks");
+  t.real("max_imbalance", max_imbalance).range(1, 10).doc("largest load over mean load before blocks move");
+}
+
+void OutputOptions::declare(io::Schema& schema) {
+  io::Table& t = schema.table("output", "files", io::Schema::Presence::implied);
+  t.text("dir", dir).doc("folder for all output, made if it does not exist");
+  t.real("plot_every_s", plot_every_s).unit("s").above(0).doc("time between plotfiles; or plot_every_tau0; neither: first and last state");
+  t.real("plot_every_tau0", plot_every_tau0).unit("tau0").above(0).doc("the same in units of tau0");
+  t.real("diagnostics_every_s", diagnostics_every_s).unit("s").above(0).doc("time between lines of the CSV files; default a hundredth of the run");
+  t.real("diagnostics_every_tau0", diagnostics_every_tau0).unit("tau0").above(0).doc("the same in units of tau0");
+  t.real("checkpoint_every_s", checkpoint_every_s).unit("s").at_least(0).doc("simulated time between checkpoints; 0: none but at the end of a stopped run");
+  t.integer("checkpoint_every_steps", checkpoint_every_steps).at_least(0).doc("time steps between checkpoints; 0: none");
+  t.integer("keep_checkpoints", keep_checkpoints).at_least(1).doc("checkpoints kept; older ones are removed");
+  schema.check({"output"}, [this](io::Checks& c) {
+    if (plot_every_s && plot_every_tau0) c.fail("output.plot_every_tau0", "not together with plot_every_s");
+    if (diagnostics_every_s && diagnostics_every_tau0)
+      c.fail("output.diagnostics_every_tau0", "not together with diagnostics_every_s");
+    if (dir.empty()) c.fail("output.dir", "the name of a folder");
+  });
+}
+
+Settings::Settings() {
+  run.declare(schema);
+  mesh.declare(schema);
+  alloy.declare(schema);
+  physics::SeedOptions::declare(schema, seed);
+  phase_field.declare(schema);
+  solute.declare(schema);
+  flow.declare(schema);
+  parallel.declare(schema);
+  output.declare(schema);
+  schema.check([this](io::Checks& checks) {
+    if (mesh.dim != DIM) {
+      checks.fail("mesh.dim", std::to_string(DIM) + " in this program (the launcher `dendrift` picks the right one)");
+      return;
+    }
+    const physics::Scales s(alloy);
+    RealVec size{};
+    for (int a = 0; a < DIM; ++a) size[a] = mesh.size_w0 ? (*mesh.size_w0)[a] : (*mesh.size_um)[a] / s.w0_um;
+    try {
+      choose_shape(size, mesh);
+    } catch (const std::invalid_argument& e) {
+      checks.fail("mesh", e.what(), "a box that does not fit");
+    }
+    const std::vector<physics::Seed> seeds = physics::make_seeds(seed, s);
+    for (std::size_t i = 0; i < seeds.size(); ++i)
+      for (int a = 0; a < DIM; ++a)
+        if (seeds[i].position[a] < 0 || seeds[i].position[a] > size[a])
+          checks.fail("seed[" + std::to_string(i) + "]." + (seed[i].position_w0 ? "position_W0" : "position_um"),
+                      "a point inside the box");
+  });
+}
+
+void Settings::parse(const std::string& path, const std::vector<std::string>& overrides) {
+  schema.parse(path, overrides);
+  derive();
+}
+
+void Settings::parse_text(const std::string& toml, const std::string& name, const std::vector<std::string>& overrides) {
+  schema.parse_text(toml, name, overrides);
+  derive();
+}
+
+void Settings::derive() {
+  scales = physics::Scales(alloy);
+  RealVec size{};
+  for (int a = 0; a < DIM; ++a) size[a] = mesh.size_w0 ? (*mesh.size_w0)[a] : (*mesh.size_um)[a] / scales.w0_um;
+  shape = choose_shape(size, mesh);
+  const auto in_tau0 = [&](const std::optional<double>& s, const std::optional<double>& tau0, double otherwise) {
+    return tau0 ? *tau0 : s ? *s / scales.tau0_s : otherwise;
+  };
+  end_time = in_tau0(run.end_time_s, run.end_time_tau0, 0);
+  plot_interval = in_tau0(output.plot_every_s, output.plot_every_tau0, 0);
+  diagnostics_interval = in_tau0(output.diagnostics_every_s, output.diagnostics_every_tau0, end_time / 100);
+}
+
+amr::MeshShape choose_shape(const RealVec& size, const MeshOptions& o) {
+  amr::MeshShape shape;
+  shape.block_cells = o.block_cells;
+  shape.sides = o.sides;
+  const double n = o.block_cells;
+  const auto near_integer = [](double x) { return std::abs(x - std::round(x)) < 1e-6 * std::max(1.0, x); };
+  if (o.root_blocks) {
+    shape.root_blocks = *o.root_blocks;
+    shape.max_level = *o.levels - 1;
+    shape.root_dx = size[0] / ((*o.root_blocks)[0] * n);
+    for (int a = 1; a < DIM; ++a)
+      if (!near_integer(size[a] / (shape.root_dx * n)) ||
+          std::round(size[a] / (shape.root_dx * n)) != (*o.root_blocks)[a])
+        throw std::invalid_argument("root_blocks in proportion to the sides of the box, so that cells are cubes");
+    return shape;
+  }
+  // Deep trees first: few root blocks are what multigrid wants; accept the first that wastes less than 7 %.
+  double best = 0;
+  for (int level = 14; level >= 0; --level) {
+    const double unit = n * static_cast<double>(1 << level);
+    const int least = std::max(1, static_cast<int>(std::ceil(size[0] / (unit * o.dx_w0) - 1e-9)));
+    for (int r = least; r < least + 16; ++r) {
+      IntVec roots{};
+      bool fits = true;
+      for (int a = 0; a < DIM; ++a) {
+        const double x = size[a] / size[0] * r;
+        fits = fits && near_integer(x) && std::round(x) >= 1;
+        roots[a] = static_cast<int>(std::round(x));
+      }
+      if (!fits) continue;
+      const double dx = size[0] / (unit * r);
+      if (dx > best) {
+        best = dx;
+        shape.root_blocks = roots;
+        shape.max_level = level;
+        shape.root_dx = size[0] / (n * r);
+      }
+      break;
+    }
+    if (best >= 0.93 * o.dx_w0) return shape;
+  }
+  if (best == 0) throw std::invalid_argument("sides in the ratio of small whole numbers, so that cubes tile the box");
+  return shape;
+}
+
+}  // namespace dendrift

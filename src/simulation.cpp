@@ -1,0 +1,457 @@
+#include "simulation.hpp"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <cmath>
+#include <csignal>
+#include <filesystem>
+#include <limits>
+
+#include "amr/comm.hpp"
+#include "io/hdf5.hpp"
+#include "io/manifest.hpp"
+#include "io/plotfile.hpp"
+#include "output.hpp"
+#include "physics/alloy_kernel.hpp"
+#include "physics/flow.hpp"
+#include "physics/modules.hpp"
+
+namespace dendrift {
+
+namespace {
+
+volatile std::sig_atomic_t stop_requested = 0;
+
+constexpr double DIAGNOSTICS_TOLERANCE = 1e-9;  // of a time, relative: reached
+
+std::size_t at(int i) { return static_cast<std::size_t>(i); }
+
+}  // namespace
+
+void Simulation::request_stop() { stop_requested = 1; }
+
+Simulation::Simulation(Settings& settings, MPI_Comm comm, const std::optional<std::string>& checkpoint)
+    : settings_(settings), comm_(comm), crystals_(physics::make_seeds(settings.seed, settings.scales)) {
+  wall_start_ = MPI_Wtime();
+  started_ = io::time_stamp();
+  modules_ = physics::make_modules(settings, crystals_);
+  amr::FieldTable fields;
+  for (const auto& m : modules_) m->declare(fields);
+  mesh_ = std::make_unique<amr::Mesh>(settings.shape, fields, comm);
+  ghosts_ = std::make_unique<amr::GhostExchange>(*mesh_);
+  psi_ = field("psi");
+  c_ = field("c");
+  if (settings.has_flow()) drift_ = physics::PrescribedFlow(settings.flow, settings.scales).velocity();
+  for (const auto& m : modules_) m->attach(*mesh_, *ghosts_);
+  if (checkpoint) {
+    resume(*checkpoint);
+  } else {
+    build_initial_mesh();
+    initial_solute_ = totals().solute_mean;
+  }
+}
+
+Simulation::~Simulation() = default;
+
+void Simulation::build_initial_mesh() {
+  for (int pass = 0; pass <= 2 * settings_.shape.max_level + 1; ++pass) {
+    for (const auto& m : modules_) m->initialize();
+    if (!adapt(pass == 0 ? 1.0 : settings_.parallel.max_imbalance)) break;
+  }
+  for (const auto& m : modules_) m->initialize();
+  adapt(1.0);  // spread the final mesh by the partitioner of choice
+  for (const auto& m : modules_) m->after_regrid();
+}
+
+void Simulation::resume(const std::string& file) {
+  const io::RunState s = io::read_state(file, comm_);
+  amr::Tree tree(settings_.shape.root_blocks, settings_.shape.periodic(), settings_.shape.max_level,
+                 io::read_leaves(file, comm_));
+  const std::vector<double> weights(at(tree.size()), 1.0);
+  std::vector<int> owners = amr::partition(settings_.parallel.partitioner, tree, weights, mesh_->ranks());
+  for (const amr::Block& b : mesh_->blocks()) mesh_->release_slot(b.slot);
+  const std::vector<int> fresh(at(tree.size()), -1);
+  mesh_->install(std::move(tree), std::move(owners), fresh);
+  io::read_fields(file, *mesh_);
+  time_ = s.time;
+  step_ = s.step;
+  auto take = [&](const char* name) { return s.numbers.at(name).at(0); };
+  next_regrid_ = static_cast<std::int64_t>(take("next_regrid"));
+  plots_ = static_cast<std::int64_t>(take("plots"));
+  lines_ = static_cast<std::int64_t>(take("lines"));
+  checkpoints_ = static_cast<std::int64_t>(take("checkpoints"));
+  last_line_step_ = static_cast<std::int64_t>(take("last_line_step"));
+  initial_solute_ = take("initial_solute");
+  const std::vector<double>& positions = s.numbers.at("crystal_positions");
+  for (std::size_t g = 0; g < crystals_.size(); ++g)
+    for (int a = 0; a < DIM; ++a) crystals_[g].position[a] = positions.at(g * DIM + at(a));
+  for (const auto& [name, values] : s.numbers)
+    if (name.starts_with("tip.")) last_tips_[name.substr(4)] = values;
+  resumed_ = true;
+  for (const auto& m : modules_) m->after_regrid();
+}
+
+io::RunState Simulation::state() const {
+  io::RunState s;
+  s.time = time_;
+  s.step = step_;
+  s.input = settings_.schema.resolved_toml();
+  s.numbers["next_regrid"] = {static_cast<double>(next_regrid_)};
+  s.numbers["plots"] = {static_cast<double>(plots_)};
+  s.numbers["lines"] = {static_cast<double>(lines_)};
+  s.numbers["checkpoints"] = {static_cast<double>(checkpoints_)};
+  s.numbers["last_line_step"] = {static_cast<double>(last_line_step_)};
+  s.numbers["initial_solute"] = {initial_solute_};
+  for (const physics::Seed& g : crystals_)
+    s.numbers["crystal_positions"].insert(s.numbers["crystal_positions"].end(), g.position.begin(), g.position.end());
+  for (const auto& [name, values] : last_tips_) s.numbers["tip." + name] = values;
+  return s;
+}
+
+bool Simulation::adapt(double max_imbalance) {
+  ghosts_->fill({psi_, c_});
+  for (const auto& m : modules_) m->before_tagging();
+  std::vector<amr::Tag> tags(at(mesh_->size()));
+  amr::parallel_for(mesh_->size(), [&](int b) {
+    for (const auto& m : modules_) m->tag(b, tags[at(b)]);
+  });
+  const amr::Proposal proposal = amr::propose(*mesh_, tags);
+  return amr::regrid(*mesh_, *ghosts_, proposal, {settings_.parallel.partitioner, max_imbalance});
+}
+
+void Simulation::schedule_regrid(double dt) {
+  double speed = 0;
+  ghosts_->fill({psi_, c_});
+  for (const auto& m : modules_) speed += m->front_speed();
+  // Half the buffer, so that the front may double its speed before the next look.
+  const double way = 0.5 * (settings_.phase_field.buffer_cells - 1) * mesh_->shape().dx(mesh_->shape().max_level);
+  const double steps = speed > 0 ? way / (speed * dt) : settings_.mesh.max_regrid_steps;
+  next_regrid_ = step_ + std::clamp(static_cast<std::int64_t>(std::min(steps, 1e6)), std::int64_t{1},
+                                    std::int64_t{settings_.mesh.max_regrid_steps});
+}
+
+double Simulation::max_dt() const {
+  double dt = 1e30;
+  for (const auto& m : modules_) dt = std::min(dt, m->max_dt());
+  if (dt > 1e29) dt = settings_.phase_field.max_dt_tau0;
+  return dt;
+}
+
+void Simulation::step(double dt) {
+  if (step_ >= next_regrid_) {
+    clock_.time("regrid", [&] {
+      if (adapt(settings_.parallel.max_imbalance))
+        for (const auto& m : modules_) m->after_regrid();
+      schedule_regrid(dt);
+    });
+  }
+  for (const auto& m : modules_) clock_.time(m->name(), [&] { m->advance(time_, dt, step_); });
+  for (physics::Seed& g : crystals_)
+    for (int a = 0; a < DIM; ++a) g.position[a] += dt * drift_[a];
+  time_ += dt;
+  ++step_;
+}
+
+double Simulation::next_stop() const {
+  double t = settings_.end_time;
+  t = std::min(t, static_cast<double>(lines_) * settings_.diagnostics_interval);
+  if (settings_.plot_interval > 0) t = std::min(t, static_cast<double>(plots_) * settings_.plot_interval);
+  return t;
+}
+
+Outcome Simulation::run() {
+  open_output();
+  try {
+    return run_to_end();
+  } catch (const NumericalError& e) {
+    save("failed");
+    write_manifest(std::string("failed: ") + e.what());
+    throw;
+  }
+}
+
+Outcome Simulation::run_to_end() {
+  const auto reached = [&](double t) { return time_ >= t * (1 - DIAGNOSTICS_TOLERANCE); };
+  const auto due = [&](std::int64_t count, double interval) {
+    return interval > 0 && reached(static_cast<double>(count) * interval);
+  };
+  const double checkpoint_interval = settings_.output.checkpoint_every_s / settings_.scales.tau0_s;
+  double dt = 0;
+  while (true) {
+    const bool end = reached(settings_.end_time) || step_ >= settings_.run.max_steps;
+    if (due(lines_, settings_.diagnostics_interval) || end) {
+      clock_.time("diagnostics", [&] {
+        const Totals t = totals();
+        check_finite(t);
+        if (step_ != last_line_step_) {
+          write_line(t, dt);
+          write_tips();
+          last_line_step_ = step_;
+        }
+        while (due(lines_, settings_.diagnostics_interval)) ++lines_;
+        progress(t, dt, end);
+      });
+    }
+    if (due(plots_, settings_.plot_interval) || (plots_ == 0) || end) {
+      clock_.time("plotfile", [&] { write_plotfile(); });
+      if (plots_ == 0) plots_ = 1;
+      while (due(plots_, settings_.plot_interval)) ++plots_;
+    }
+    if (end) break;
+    const bool steps_due = settings_.output.checkpoint_every_steps > 0 && step_ > 0 &&
+                           step_ % settings_.output.checkpoint_every_steps == 0;
+    if (due(checkpoints_ + 1, checkpoint_interval) || steps_due) {
+      while (due(checkpoints_ + 1, checkpoint_interval)) ++checkpoints_;
+      clock_.time("checkpoint", [&] { save("chk"); });
+    }
+    const double limit = settings_.run.wall_clock_limit_s;
+    if (amr::global_any(stop_requested != 0 || (limit > 0 && MPI_Wtime() - wall_start_ > limit), comm_)) {
+      clock_.time("checkpoint", [&] { save("chk"); });
+      write_manifest("stopped");
+      return Outcome::stopped;
+    }
+    const double stop = next_stop();
+    const double pieces = std::max(1.0, std::ceil((stop - time_) / max_dt() - 1e-9));
+    dt = (stop - time_) / pieces;
+    step(dt);
+    if (pieces == 1) time_ = stop;
+  }
+  write_manifest("done");
+  return Outcome::done;
+}
+
+void Simulation::print_check() {
+  const physics::Scales& s = settings_.scales;
+  const double dt = max_dt();
+  const double dx = mesh_->shape().dx(mesh_->shape().max_level);
+  const Totals t = totals();
+  step(dt);
+  const double begin = MPI_Wtime();
+  step(dt);
+  const double each = amr::global_max(MPI_Wtime() - begin, comm_);
+  const auto bytes = static_cast<double>(mesh_->bytes());
+  const double memory = amr::global_max(bytes, comm_) * mesh_->ranks();
+  if (mesh_->rank() != 0) return;
+  const double steps = std::min(settings_.end_time / dt, static_cast<double>(settings_.run.max_steps));
+  fmt::print("input is valid\n");
+  fmt::print("output dir: {}\n", settings_.output.dir);
+  fmt::print("c_l     {:.6g} wt%\nd0      {:.6g} um\nW0      {:.6g} um\ntau0    {:.6g} s\nlambda  {:.6g}\n",
+             s.c_l_wt, s.d0_um, s.w0_um, s.tau0_s, s.lambda);
+  fmt::print("D       {:.6g} W0^2/tau0\ndt      {:.4g} tau0 = {:.4g} s\n", s.diffusivity, dt, dt * s.tau0_s);
+  fmt::print("end     {:.6g} tau0 = {:.6g} s\n", settings_.end_time, settings_.end_time * s.tau0_s);
+  fmt::print("box    ");
+  for (int a = 0; a < DIM; ++a) fmt::print(" {:.6g}", mesh_->shape().hi()[a]);
+  fmt::print(" W0, root blocks");
+  for (const int r : mesh_->shape().root_blocks) fmt::print(" {}", r);
+  fmt::print(", {} levels, blocks of {} cells a side\n", mesh_->shape().max_level + 1, mesh_->layout().n);
+  fmt::print("dx      {:.6g} W0 = {:.6g} um on the finest level\n", dx, dx * s.w0_um);
+  fmt::print("cells   {} in {} blocks at the start\n", t.blocks * volume(filled(mesh_->layout().n)), t.blocks);
+  fmt::print("memory  {:.1f} MB in fields at the start\n", memory / 1e6);
+  fmt::print("cost    {:.0f} steps, {:.3g} s each at the start: at least {:.3g} s on {} ranks\n", steps, each, steps * each,
+             mesh_->ranks());
+}
+
+Totals Simulation::totals() {
+  Totals t;
+  std::array<amr::ExactSum, 2> sums;
+  std::vector<std::array<double, 2>> parts(at(mesh_->size()));
+  const amr::Layout& layout = mesh_->layout();
+  amr::parallel_for(mesh_->size(), [&](int b) {
+    const double* psi = mesh_->cells(psi_, b);
+    const double* c = mesh_->cells(c_, b);
+    double solid = 0, solute = 0;
+    amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
+      const std::ptrdiff_t q = layout.offset(cell);
+      solid += 0.5 * (1 + physics::phi_of_psi(psi[q]));
+      solute += c[q];
+    });
+    const double volume = std::pow(mesh_->block(b).dx, DIM);
+    parts[at(b)] = {solid * volume, solute * volume};
+  });
+  bool finite = true;
+  for (const auto& p : parts)
+    for (std::size_t i = 0; i < 2; ++i) {
+      finite = finite && std::isfinite(p[i]);
+      if (finite) sums[i].add(p[i]);
+    }
+  const std::vector<double> all = amr::exact_sums(sums, comm_);
+  double box = 1;
+  for (int a = 0; a < DIM; ++a) box *= mesh_->shape().hi()[a] - mesh_->shape().lo[a];
+  t.solid_fraction = all[0] / box;
+  t.solute_mean = all[1] / box;
+  if (amr::global_any(!finite, comm_)) t.solute_mean = std::numeric_limits<double>::quiet_NaN();
+  t.blocks = mesh_->tree().size();
+  t.levels = mesh_->tree().finest_level() + 1;
+  return t;
+}
+
+std::vector<physics::Tip> Simulation::tips() {
+  ghosts_->fill({psi_});
+  return physics::find_tips(*mesh_, psi_, crystals_);
+}
+
+void Simulation::check_finite(const Totals& t) const {
+  if (!std::isfinite(t.solute_mean))
+    throw NumericalError(fmt::format("phi or c is not finite at step {}, t = {:.6g} tau0; a smaller "
+                                     "phase_field.max_dt_tau0 may help", step_, time_));
+}
+
+void Simulation::open_output() {
+  const bool root = mesh_->rank() == 0;
+  io::SharedFailure failure;
+  if (root)
+    failure.attempt(settings_.output.dir, "open the output", [&] {
+      std::error_code error;
+      std::filesystem::create_directories(settings_.output.dir, error);
+      if (error) throw io::OutputError(settings_.output.dir, "create the folder", error.message());
+      const std::string diagnostics =
+          "step,time_s,time_tau0,dt_tau0,blocks,cells,levels,solid_fraction,solute_mean_wt,solute_drift_rel,"
+          "max_speed_um_s,div_max_rel,flow_iterations,wall_s";
+      const std::string tips = std::string("time_s,grain,arm,euler_deg,x_um,y_um,") + (DIM == 3 ? "z_um," : "") +
+                               "speed_um_s,radius_um";
+      const double now = time_ * settings_.scales.tau0_s;
+      if (resumed_) {
+        diagnostics_csv_ = std::make_unique<io::CsvFile>(path("diagnostics.csv"), diagnostics, "time_s", now);
+        tips_csv_ = std::make_unique<io::CsvFile>(path("tips.csv"), tips, "time_s", now);
+      } else {
+        for (const auto& e : std::filesystem::directory_iterator(settings_.output.dir)) {
+          const std::string name = e.path().filename().string();
+          // What an earlier run left here would be mistaken for this one's.
+          if (name.starts_with("plt") || name.starts_with("chk_")) std::filesystem::remove(e.path());
+        }
+        diagnostics_csv_ = std::make_unique<io::CsvFile>(path("diagnostics.csv"), diagnostics);
+        tips_csv_ = std::make_unique<io::CsvFile>(path("tips.csv"), tips);
+      }
+    });
+  failure.agree(comm_);
+  write_manifest("running");
+}
+
+void Simulation::write_line(const Totals& t, double dt) {
+  if (mesh_->rank() != 0) return;
+  const physics::Scales& s = settings_.scales;
+  double speed = 0;
+  for (const double v : drift_) speed += v * v;
+  diagnostics_csv_->line({static_cast<double>(step_), time_ * s.tau0_s, time_, dt, static_cast<double>(t.blocks),
+                          static_cast<double>(t.blocks * volume(filled(mesh_->layout().n))),
+                          static_cast<double>(t.levels), t.solid_fraction, t.solute_mean * s.c_l_wt, solute_drift(t),
+                          s.speed_um_s(std::sqrt(speed)), 0, 0, MPI_Wtime() - wall_start_});
+}
+
+void Simulation::write_tips() {
+  const physics::Scales& s = settings_.scales;
+  for (const physics::Tip& t : tips()) {
+    const std::string name = fmt::format("{}.{}", t.grain, t.arm);
+    double speed = 0;
+    const auto last = last_tips_.find(name);
+    if (last != last_tips_.end() && time_ > last->second[0])
+      speed = (t.length - last->second[1]) / (time_ - last->second[0]);
+    last_tips_[name] = {time_, t.length};
+    if (mesh_->rank() != 0) continue;
+    // Gravity points along -y (2D) or -z (3D); 0 degrees is down.
+    const double euler = std::acos(std::clamp(-t.direction[DIM - 1], -1.0, 1.0)) * 180 / M_PI;
+    std::vector<double> line{time_ * s.tau0_s, static_cast<double>(t.grain), static_cast<double>(t.arm), euler};
+    for (const double x : t.position) line.push_back(x * s.w0_um);
+    line.push_back(s.speed_um_s(speed));
+    line.push_back(t.radius * s.w0_um);
+    tips_csv_->line(line);
+  }
+}
+
+void Simulation::write_plotfile() {
+  const physics::Scales& s = settings_.scales;
+  const amr::Layout& layout = mesh_->layout();
+  const double k = s.k;
+  auto of_state = [&](auto&& f) {
+    return [this, &layout, f](int b, std::span<double> out) {
+      const double* psi = mesh_->cells(psi_, b);
+      const double* c = mesh_->cells(c_, b);
+      std::size_t i = 0;
+      amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
+        const std::ptrdiff_t q = layout.offset(cell);
+        out[i++] = f(b, physics::phi_of_psi(psi[q]), c[q]);
+      });
+    };
+  };
+  const double angle = crystals_.empty() ? 0 : std::atan2(crystals_[0].axes[0][1], crystals_[0].axes[0][0]);
+  std::vector<PlotComponent> fields{
+      {"phi", of_state([](int, double phi, double) { return phi; })},
+      {"U", of_state([k](int, double phi, double c) { return physics::u_of_c(c, phi, k); })},
+      {"c", of_state([&s](int, double, double c) { return c * s.c_l_wt; })},
+      {"alpha", of_state([angle](int, double, double) { return angle; })},
+  };
+  for (int a = 0; a < DIM; ++a) {
+    const double v = s.speed_um_s(drift_[a]);
+    fields.push_back({std::string("velocity_") + "xyz"[a], of_state([v](int, double, double) { return v; })});
+  }
+  fields.push_back({"pressure", of_state([](int, double, double) { return 0.0; })});
+  fields.push_back({"level", of_state([this](int b, double, double) { return double(mesh_->block(b).index.level); })});
+  fields.push_back({"rank", of_state([this](int, double, double) { return double(mesh_->rank()); })});
+  fields.push_back({"grain", of_state([](int, double phi, double) { return phi > 0 ? 0.0 : -1.0; })});
+  const std::string name = fmt::format("plt_{:07d}.hdf", step_);
+  write_plot(path(name), *mesh_, s, time_ * s.tau0_s, step_, fields);
+  io::SharedFailure failure;
+  if (mesh_->rank() == 0)
+    failure.attempt(path("plt.hdf.series"), "list the plotfile",
+                    [&] { io::append_series(path("plt.hdf.series"), name, time_ * s.tau0_s); });
+  failure.agree(comm_);
+}
+
+void Simulation::write_checkpoint(const std::string& file) { io::write_checkpoint(file, *mesh_, state()); }
+
+void Simulation::save(const char* prefix) {
+  const std::string file = path(fmt::format("{}_{:07d}.h5", prefix, step_));
+  write_checkpoint(file);
+  saved_.erase(std::remove(saved_.begin(), saved_.end(), file), saved_.end());
+  saved_.push_back(file);
+  while (saved_.size() > at(settings_.output.keep_checkpoints)) {
+    if (mesh_->rank() == 0) std::filesystem::remove(saved_.front());
+    saved_.erase(saved_.begin());
+  }
+}
+
+void Simulation::write_manifest(const std::string& status) {
+  std::map<std::string, double> phases = clock_.seconds();
+  phases["ghost_fill"] = ghosts_->fill_seconds();
+  phases["ghost_wait"] = ghosts_->wait_seconds();
+  std::vector<double> values;
+  for (const auto& [name, seconds] : phases) values.push_back(seconds);
+  // Ranks know the same phases: names come from collective code.
+  MPI_Allreduce(MPI_IN_PLACE, values.data(), static_cast<int>(values.size()), MPI_DOUBLE, MPI_SUM, comm_);
+  std::size_t i = 0;
+  for (auto& [name, seconds] : phases) seconds = values[i++] / mesh_->ranks();
+  io::SharedFailure failure;
+  if (mesh_->rank() == 0)
+    failure.attempt(path("manifest.json"), "write the manifest", [&] {
+      io::Manifest m;
+      m.status = status;
+      m.started = started_;
+      m.ranks = mesh_->ranks();
+      m.input = settings_.schema.resolved_toml();
+      m.time_s = time_ * settings_.scales.tau0_s;
+      m.steps = step_;
+      m.wall_s = MPI_Wtime() - wall_start_;
+      m.phases = phases;
+      m.blocks = mesh_->tree().size();
+      m.block_cells = mesh_->layout().n;
+      io::write_manifest(path("manifest.json"), m);
+    });
+  failure.agree(comm_);
+}
+
+void Simulation::progress(const Totals& t, double dt, bool last) {
+  if (mesh_->rank() != 0) return;
+  const double now = MPI_Wtime();
+  if (!last && now - last_progress_ < 1.0) return;
+  last_progress_ = now;
+  const double wall = now - wall_start_;
+  const double done = settings_.end_time > 0 ? time_ / settings_.end_time : 1;
+  const double left = done > 0 ? wall / done - wall : 0;
+  fmt::print("step {:7d}  t {:9.4g} s  {:5.1f} %  dt {:6.3f} tau0  cells {:8d}  solid {:7.4f}  wall {:6.1f} s  left {:6.1f} s\n",
+             step_, time_ * settings_.scales.tau0_s, 100 * done, dt, t.blocks * volume(filled(mesh_->layout().n)),
+             t.solid_fraction, wall, last ? 0 : left);
+  std::fflush(stdout);
+}
+
+}  // namespace dendrift

@@ -1,0 +1,127 @@
+/// \file
+/// A run: state, one time step, and what is written when.
+#pragma once
+
+#include <map>
+#include <memory>
+#include <optional>
+#include <string>
+
+#include "amr/ghost.hpp"
+#include "amr/mesh.hpp"
+#include "amr/regrid.hpp"
+#include "io/checkpoint.hpp"
+#include "io/diagnostics.hpp"
+#include "physics/crystals.hpp"
+#include "physics/module.hpp"
+#include "settings.hpp"
+
+namespace dendrift {
+
+/// The state has lost its meaning: not finite, or out of bounds.
+class NumericalError : public std::runtime_error {
+  using std::runtime_error::runtime_error;
+};
+
+/// Wall time by phase of the step, seconds of this rank.
+class PhaseClock {
+ public:
+  template <class F>
+  auto time(const char* phase, F&& f) {
+    const double begin = MPI_Wtime();
+    struct Stop {
+      double& sum;
+      double begin;
+      ~Stop() { sum += MPI_Wtime() - begin; }
+    } stop{seconds_[phase], begin};
+    return f();
+  }
+  const std::map<std::string, double>& seconds() const { return seconds_; }
+
+ private:
+  std::map<std::string, double> seconds_;
+};
+
+/// Sums over the leaves, exact and independent of the distribution.
+struct Totals {
+  double solid_fraction = 0;
+  double solute_mean = 0;  ///< in units of c_l
+  std::int64_t blocks = 0;
+  int levels = 0;
+};
+
+enum class Outcome { done, stopped };
+
+class Simulation {
+ public:
+  /// Builds the mesh and the initial state, or reads it from a checkpoint. Nothing is written. Collective.
+  Simulation(Settings& settings, MPI_Comm comm, const std::optional<std::string>& checkpoint = std::nullopt);
+  ~Simulation();
+
+  /// Steps to the end, writing output. Returns `stopped` after a checkpoint if asked to stop (request_stop, wall
+  /// clock limit). Throws NumericalError (state saved) or io::OutputError. Collective.
+  Outcome run();
+
+  /// Prints the derived numbers and an estimate of the cost, from two steps that it takes. Collective.
+  void print_check();
+
+  /// Safe in a signal handler.
+  static void request_stop();
+
+  // For tests and tools.
+  void step(double dt);  ///< one step of physics, then the mesh if its time has come
+  amr::Mesh& mesh() { return *mesh_; }
+  amr::GhostExchange& ghosts() { return *ghosts_; }
+  amr::CellField field(const std::string& name) const { return {mesh_->fields().find(name).value()}; }
+  double time() const { return time_; }
+  std::int64_t step_number() const { return step_; }
+  Totals totals();
+  std::vector<physics::Tip> tips();
+  double solute_drift(const Totals& t) const { return (t.solute_mean - initial_solute_) / initial_solute_; }
+  double max_dt() const;
+  void write_checkpoint(const std::string& path);
+  const PhaseClock& clock() const { return clock_; }
+
+ private:
+  void build_initial_mesh();
+  void resume(const std::string& path);
+  bool adapt(double max_imbalance);
+  void schedule_regrid(double dt);
+  double next_stop() const;
+  void check_finite(const Totals& t) const;
+
+  Outcome run_to_end();
+  void open_output();
+  void write_line(const Totals& t, double dt);
+  void write_tips();
+  void write_plotfile();
+  void save(const char* prefix);
+  void write_manifest(const std::string& status);
+  void progress(const Totals& t, double dt, bool last);
+  std::string path(const std::string& name) const { return settings_.output.dir + "/" + name; }
+  io::RunState state() const;
+
+  Settings& settings_;
+  MPI_Comm comm_;
+  physics::Modules modules_;
+  std::unique_ptr<amr::Mesh> mesh_;
+  std::unique_ptr<amr::GhostExchange> ghosts_;
+  std::vector<physics::Seed> crystals_;
+  RealVec drift_{};  // velocity that carries the crystals
+  amr::CellField psi_, c_;
+  double time_ = 0;  // tau0
+  std::int64_t step_ = 0;
+  std::int64_t next_regrid_ = 0;
+  std::int64_t plots_ = 0, lines_ = 0, checkpoints_ = 0;  // written so far: the next is due at that multiple
+  double initial_solute_ = 0;
+  std::map<std::string, std::vector<double>> last_tips_;  // "grain.arm" -> time, length
+  std::int64_t last_line_step_ = -1;
+  bool resumed_ = false;
+  std::unique_ptr<io::CsvFile> diagnostics_csv_, tips_csv_;
+  std::vector<std::string> saved_;
+  PhaseClock clock_;
+  double wall_start_ = 0, last_progress_ = 0;
+  std::string started_;
+};
+
+}  // namespace dendrift
