@@ -100,6 +100,16 @@ Settings::Settings() {
     } catch (const std::invalid_argument& e) {
       checks.fail("mesh", e.what(), "a box that does not fit");
     }
+    // Steps end on output times, so these must not be shorter than steps worth taking.
+    constexpr double SHORTEST = 1e-3;  // tau0
+    const std::pair<const char*, std::optional<double>> intervals[] = {
+        {"output.plot_every_s", output.plot_every_s ? *output.plot_every_s / s.tau0_s : output.plot_every_s},
+        {"output.plot_every_tau0", output.plot_every_tau0},
+        {"output.diagnostics_every_s",
+         output.diagnostics_every_s ? *output.diagnostics_every_s / s.tau0_s : output.diagnostics_every_s},
+        {"output.diagnostics_every_tau0", output.diagnostics_every_tau0}};
+    for (const auto& [key, tau0] : intervals)
+      if (tau0 && *tau0 < SHORTEST) checks.fail(key, "at least .001 tau0: steps end on output times");
     const std::vector<physics::Seed> seeds = physics::make_seeds(seed, s);
     for (std::size_t i = 0; i < seeds.size(); ++i)
       for (int a = 0; a < DIM; ++a)

@@ -27,6 +27,26 @@ constexpr double DIAGNOSTICS_TOLERANCE = 1e-9;  // of a time, relative: reached
 
 std::size_t at(int i) { return static_cast<std::size_t>(i); }
 
+// The first multiple of an interval that lies after t.
+std::int64_t next_multiple(double t, double interval) {
+  if (interval <= 0) return 1;
+  return static_cast<std::int64_t>(std::min(t / interval * (1 + DIAGNOSTICS_TOLERANCE), 1e15)) + 1;
+}
+
+// Neumaier's sum: thousands of nearly equal terms would otherwise round the same way and look like lost solute.
+class Compensated {
+ public:
+  void add(double x) {
+    const double t = sum_ + x;
+    rest_ += std::abs(sum_) >= std::abs(x) ? (sum_ - t) + x : (x - t) + sum_;
+    sum_ = t;
+  }
+  double value() const { return sum_ + rest_; }
+
+ private:
+  double sum_ = 0, rest_ = 0;
+};
+
 }  // namespace
 
 void Simulation::request_stop() { stop_requested = 1; }
@@ -189,20 +209,19 @@ Outcome Simulation::run_to_end() {
           write_tips();
           last_line_step_ = step_;
         }
-        while (due(lines_, settings_.diagnostics_interval)) ++lines_;
+        lines_ = next_multiple(time_, settings_.diagnostics_interval);
         progress(t, dt, end);
       });
     }
     if (due(plots_, settings_.plot_interval) || (plots_ == 0) || end) {
       clock_.time("plotfile", [&] { write_plotfile(); });
-      if (plots_ == 0) plots_ = 1;
-      while (due(plots_, settings_.plot_interval)) ++plots_;
+      plots_ = next_multiple(time_, settings_.plot_interval);
     }
     if (end) break;
     const bool steps_due = settings_.output.checkpoint_every_steps > 0 && step_ > 0 &&
                            step_ % settings_.output.checkpoint_every_steps == 0;
     if (due(checkpoints_ + 1, checkpoint_interval) || steps_due) {
-      while (due(checkpoints_ + 1, checkpoint_interval)) ++checkpoints_;
+      checkpoints_ = next_multiple(time_, checkpoint_interval) - 1;
       clock_.time("checkpoint", [&] { save("chk"); });
     }
     const double limit = settings_.run.wall_clock_limit_s;
@@ -260,14 +279,15 @@ Totals Simulation::totals() {
   amr::parallel_for(mesh_->size(), [&](int b) {
     const double* psi = mesh_->cells(psi_, b);
     const double* c = mesh_->cells(c_, b);
-    double solid = 0, solute = 0;
+    double solid = 0;
+    Compensated solute;
     amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
       const std::ptrdiff_t q = layout.offset(cell);
       solid += 0.5 * (1 + physics::phi_of_psi(psi[q]));
-      solute += c[q];
+      solute.add(c[q]);
     });
     const double volume = std::pow(mesh_->block(b).dx, DIM);
-    parts[at(b)] = {solid * volume, solute * volume};
+    parts[at(b)] = {solid * volume, solute.value() * volume};
   });
   bool finite = true;
   for (const auto& p : parts)
@@ -309,7 +329,7 @@ void Simulation::open_output() {
           "step,time_s,time_tau0,dt_tau0,blocks,cells,levels,solid_fraction,solute_mean_wt,solute_drift_rel,"
           "max_speed_um_s,div_max_rel,flow_iterations,wall_s";
       const std::string tips = std::string("time_s,grain,arm,euler_deg,x_um,y_um,") + (DIM == 3 ? "z_um," : "") +
-                               "speed_um_s,radius_um";
+                               "speed_um_s,radius_um,off_axis_deg";
       const double now = time_ * settings_.scales.tau0_s;
       if (resumed_) {
         diagnostics_csv_ = std::make_unique<io::CsvFile>(path("diagnostics.csv"), diagnostics, "time_s", now);
@@ -355,6 +375,7 @@ void Simulation::write_tips() {
     for (const double x : t.position) line.push_back(x * s.w0_um);
     line.push_back(s.speed_um_s(speed));
     line.push_back(t.radius * s.w0_um);
+    line.push_back(t.off_axis_deg);
     tips_csv_->line(line);
   }
 }

@@ -41,6 +41,10 @@ void write_list(const Group& file, const std::string& name, const std::vector<T>
 // Everything but the values of the fields; one rank alone.
 void create_file(const std::string& path, const amr::Mesh& mesh, const RunState& state) {
   File file = File::create(path);
+  const auto cells = static_cast<hsize_t>(volume(filled(mesh.layout().n)) * mesh.tree().size());
+  const std::vector<int> fields_kept = checkpointed(mesh.fields());
+  // A full disk must show here, where one rank alone can still give up.
+  reserve_space(path, (1 << 20) + fields_kept.size() * cells * sizeof(double) + mesh.owners().size() * 16);
   file.write_attribute("format", std::int32_t{CHECKPOINT_FORMAT});
   file.write_attribute("dim", std::int32_t{DIM});
   file.write_attribute("block_cells", std::int32_t{mesh.layout().n});
@@ -58,10 +62,9 @@ void create_file(const std::string& path, const amr::Mesh& mesh, const RunState&
     }
     write_list(file, "leaves", leaves);
     const Group fields = file.create_group("fields");
-    const auto values = static_cast<hsize_t>(volume(filled(mesh.layout().n)) * mesh.tree().size());
-    for (const int id : checkpointed(mesh.fields()))
+    for (const int id : fields_kept)
       static_cast<void>(
-          fields.create_dataset(mesh.fields().row(id).name, Type::of<double>(), Dataspace::simple(values)));
+          fields.create_dataset(mesh.fields().row(id).name, Type::of<double>(), Dataspace::simple(cells)));
   }
   file.close();
 }
@@ -98,6 +101,7 @@ void write_checkpoint(const std::string& path, const amr::Mesh& mesh, const RunS
   failure.agree(mesh.comm());
   if (mesh.rank() == 0)
     failure.attempt(path, "complete the checkpoint", [&] {
+      release_excess_space(part);
       sync_file(part);
       rename_file(part, path);
     });

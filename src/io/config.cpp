@@ -670,7 +670,7 @@ std::string Schema::keys_markdown() const {
     for (const Key& key : section.table.keys()) {
       Row row = row_of(key.spec());
       for (std::string& cell : row)
-        for (std::size_t i = 0; (i = cell.find('|', i)) != std::string::npos; i += 2) cell.insert(i, "\\");
+        for (std::size_t i = 0; (i = cell.find('|', i)) != std::string::npos; i += 2) cell.insert(i, 1, '\\');
       row[0] = fmt::format("`{}`", row[0]);
       text += fmt::format("| {} |\n", fmt::join(row, " | "));
     }

@@ -119,20 +119,29 @@ void reduce_max(std::vector<double>& values, MPI_Comm comm) {
   MPI_Allreduce(MPI_IN_PLACE, values.data(), static_cast<int>(values.size()), MPI_DOUBLE, MPI_MAX, comm);
 }
 
-// Least squares of length - crossing = offset^2 / (2 radius) + constant.
-double fitted_radius(const std::vector<Ray>& rays, std::size_t tip) {
-  double n = 0, x = 0, y = 0, xx = 0, xy = 0;
+// Least squares parabola through the crossings: position = apex - (offset - shift)^2 / (2 radius).
+struct Parabola {
+  double radius = 0;
+  double shift = 0;
+};
+
+Parabola fitted_parabola(const std::vector<Ray>& rays, std::size_t tip) {
+  // Offsets are symmetric about the axis, so the odd term separates from the even ones.
+  double n = 0, x = 0, xx = 0, y = 0, xy = 0, odd = 0;
   for (const Ray& r : rays) {
-    if (r.tip != tip || r.crossing == NOWHERE) continue;
-    const double u = 0.5 * r.offset * r.offset;
+    if (r.tip != tip) continue;
+    if (r.crossing == NOWHERE) return {};
+    const double square = r.offset * r.offset;
     n += 1;
-    x += u;
-    y -= r.crossing;
-    xx += u * u;
-    xy -= u * r.crossing;
+    x += square;
+    xx += square * square;
+    y += r.crossing;
+    xy += square * r.crossing;
+    odd += r.offset * r.crossing;
   }
-  const double curvature = (n * xy - x * y) / (n * xx - x * x);
-  return n >= 3 && curvature > 0 ? 1 / curvature : 0;
+  const double curvature = -2 * (n * xy - x * y) / (n * xx - x * x);
+  if (!(n >= 3 && curvature > 0)) return {};
+  return {1 / curvature, odd / x / curvature};
 }
 
 }  // namespace
@@ -178,7 +187,15 @@ std::vector<Tip> find_tips(const amr::Mesh& mesh, amr::CellField psi, const std:
   }
   reduce_max(crossings, mesh.comm());
   for (std::size_t i = 0; i < rays.size(); ++i) rays[i].crossing = crossings[i];
-  for (std::size_t i = 0; i < tips.size(); ++i) tips[i].radius = fitted_radius(rays, i);
+  for (std::size_t i = 0; i < tips.size(); ++i) {
+    const Parabola p = fitted_parabola(rays, i);
+    tips[i].radius = p.radius;
+    if (DIM == 2 && tips[i].length > 0) {
+      // sides_of gives the other axis; it lies counterclockwise of the arm for arms 0 and 3 (x, -y) only.
+      const double turn = tips[i].arm == 0 || tips[i].arm == 3 ? 1 : -1;
+      tips[i].off_axis_deg = turn * std::atan2(p.shift, tips[i].length) * 180 / M_PI;
+    }
+  }
   tips.erase(std::remove_if(tips.begin(), tips.end(), [](const Tip& t) { return t.length == 0; }), tips.end());
   return tips;
 }

@@ -18,6 +18,7 @@ struct Tip {
   RealVec direction{};
   RealVec position{};     ///< of phi = 0 on the arm's axis
   double length = 0;      ///< distance from the centre; 0: no solid on the axis
+  double off_axis_deg = 0;  ///< 2D: angle by which the apex of that parabola lies off the axis, counterclockwise
   double radius = 0;      ///< of the parabola (the mean of two in 3D) through phi = 0 within TIP_WINDOW of the axis
 };
 

@@ -1,0 +1,321 @@
+#!/usr/bin/python3
+"""Runs the verification cases of docs/verification.md and writes their tables to docs/results/*.csv.
+
+usage: tools/verify.py [--build DIR] [--ranks N] [--keep] CASE ...      (no CASE: list them; "all": every one)
+Each case runs dendrift on an input of inputs/verification with overrides, and compares tips.csv and diagnostics.csv
+with the reference numbers below. Lengths in W0, times in tau0 unless a column says otherwise.
+"""
+import argparse
+import csv
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+CASES = {}
+ARGS = None
+
+
+def case(f):
+    CASES[f.__name__] = f
+    return f
+
+
+class Run:
+    """One run of dendrift; tips by arm and time, diagnostics by time."""
+
+    def __init__(self, name, *overrides, ranks=None):
+        folder = tempfile.mkdtemp(prefix="dendrift_verify_") if not ARGS.keep else os.path.join("out", "verify")
+        self.dir = os.path.join(folder, "run")
+        command = ["mpirun", "--oversubscribe", "-n", str(ranks or ARGS.ranks), os.path.join(ARGS.build, "dendrift"),
+                   os.path.join(ROOT, "inputs", "verification", name), f"output.dir={self.dir}", *overrides]
+        done = subprocess.run(command, capture_output=True, text=True)
+        if done.returncode != 0:
+            sys.exit(f"{' '.join(command)}\nended with {done.returncode}:\n{done.stdout[-2000:]}{done.stderr[-3000:]}")
+        check = subprocess.run([os.path.join(ARGS.build, "dendrift"), os.path.join(ROOT, "inputs", "verification", name),
+                                *overrides, "run.max_steps=1", "--check"], capture_output=True, text=True).stdout
+        self.scale = {line.split()[0]: float(line.split()[1]) for line in check.splitlines()
+                      if line.split()[0] in ("W0", "tau0", "d0", "lambda", "D", "dx")}
+        self.manifest = json.load(open(os.path.join(self.dir, "manifest.json")))
+        self.wall = self.manifest["wall_s"]
+        w0, tau0 = self.scale["W0"], self.scale["tau0"]
+        self.diagnostics = list(csv.DictReader(open(os.path.join(self.dir, "diagnostics.csv"))))
+        # Seconds and tau0 of the same lines: the exact ratio, not the six digits that --check prints.
+        last = self.diagnostics[-1]
+        if float(last["time_tau0"]) > 0:
+            tau0 = float(last["time_s"]) / float(last["time_tau0"])
+        self.tips = {}
+        for row in csv.DictReader(open(os.path.join(self.dir, "tips.csv"))):
+            t = round(float(row["time_s"]) / tau0, 6)
+            x = [float(row[f"{a}_um"]) / w0 for a in "xyz" if f"{a}_um" in row]
+            self.tips.setdefault(int(row["arm"]), {})[t] = (x, float(row["radius_um"]) / w0, float(row["off_axis_deg"]))
+        self.drift = max(abs(float(d["solute_drift_rel"])) for d in self.diagnostics)
+        self.cells = int(last["cells"])
+        self.steps = int(last["step"])
+
+    def length(self, arm, t, centre=(0, 0, 0)):
+        return math.dist(self.tips[arm][t][0], centre[: len(self.tips[arm][t][0])])
+
+    def speed(self, arm, t, h, centre=(0, 0, 0), drift=(0, 0, 0)):
+        moved = [c + v * 2 * h for c, v in zip(centre, drift)]
+        return (self.length(arm, t + h, moved) - self.length(arm, t - h, centre)) / (2 * h)
+
+
+def percent(value, reference):
+    return 100 * (value / reference - 1)
+
+
+def write(name, rows):
+    path = os.path.join(ROOT, "docs", "results", name + ".csv")
+    os.makedirs(os.path.dirname(path), exist_ok=True)
+    with open(path, "w", newline="") as out:
+        table = csv.DictWriter(out, rows[0].keys(), lineterminator="\n")
+        table.writeheader()
+        for row in rows:
+            table.writerow({k: f"{v:.6g}" if isinstance(v, float) else v for k, v in row.items()})
+    print(f"\n{name}: {os.path.relpath(path, ROOT)}")
+    for row in rows:
+        print("  " + "  ".join(f"{k} {v:.6g}" if isinstance(v, float) else f"{k} {v}" for k, v in row.items()))
+    sys.stdout.flush()
+
+
+def box(dx, levels, dim=2, n=16, roots=1):
+    side = roots * n * 2 ** (levels - 1) * dx
+    return [f"mesh.size_W0=[{','.join([repr(side)] * dim)}]", f"mesh.root_blocks=[{','.join([str(roots)] * dim)}]",
+            f"mesh.levels={levels}", f"mesh.block_cells={n}"]
+
+
+@case
+def growth():
+    """Row 1: tip of the quarter crystal at t = 100 and 200, against spacing; cost; adaptive against uniform."""
+    reference = {100: (21.56, 0.0751), 200: (28.18, 0.0599)}
+    rows = []
+    for dx, levels, kind in ((1.6, 7, "adaptive"), (1.25, 7, "adaptive"), (1.0, 7, "adaptive"), (0.8, 7, "adaptive"),
+                             (0.625, 7, "adaptive"), (0.5, 8, "adaptive"), (0.4, 8, "adaptive"), (1.0, 7, "uniform")):
+        if kind == "adaptive":
+            mesh = box(dx, levels)
+        else:
+            mesh = box(dx, 1, roots=2 ** (levels - 1))
+        r = Run("al_cu_free.toml", *mesh)
+        row = {"mesh": kind, "dx_W0": dx}
+        for t, (tip, v) in reference.items():
+            row |= {f"tip_{t}": r.length(0, t), f"tip_{t}_err_percent": percent(r.length(0, t), tip),
+                    f"V_{t}": r.speed(0, t, 5), f"V_{t}_err_percent": percent(r.speed(0, t, 5), v)}
+        rows.append(row | {"steps": r.steps, "cells_at_end": r.cells, "wall_s": r.wall, "drift": r.drift})
+    write("growth_2d", rows)
+
+
+@case
+def growth_dt():
+    """Row 1 at dx = 1: error of the time step against the smallest one."""
+    rows = []
+    for dt in (0.05, 0.1, 0.2, 0.3, 0.4):
+        r = Run("al_cu_free.toml", *box(1.0, 7), f"phase_field.max_dt_tau0={dt}")
+        rows.append({"max_dt_tau0": dt, "tip_100": r.length(0, 100), "tip_200": r.length(0, 200), "steps": r.steps,
+                     "wall_s": r.wall})
+    for row in rows:
+        row["tip_200_change_percent"] = percent(row["tip_200"], rows[0]["tip_200"])
+    write("growth_2d_time_step", rows)
+
+
+@case
+def growth_3d():
+    """Row 2: octant at t = 25 and 50."""
+    reference = {25: (16.77, 0.199, 16213), 50: (21.37, 0.172, 28866)}
+    rows = []
+    for dx, roots, levels in ((1.25, 3, 3), (1.0, 4, 3), (0.8, 5, 3), (0.64, 5, 3)):
+        r = Run("al_cu_free_3d.toml", *box(dx, levels, 3, roots=roots), "run.end_time_tau0=52.5")
+        side = roots * 16 * 2 ** (levels - 1) * dx
+        row = {"dx_W0": dx}
+        for t, (tip, v, vol) in reference.items():
+            solid = next(float(d["solid_fraction"]) for d in r.diagnostics if abs(float(d["time_tau0"]) - t) < 1e-6)
+            row |= {f"tip_{t}": r.length(0, t), f"tip_{t}_err_percent": percent(r.length(0, t), tip),
+                    f"V_{t}": r.speed(0, t, 2.5), f"V_{t}_err_percent": percent(r.speed(0, t, 2.5), v),
+                    f"volume_{t}_err_percent": percent(8 * solid * side**3, vol)}
+        rows.append(row | {"arms_differ": max(abs(r.length(a, 50) - r.length(0, 50)) for a in (2, 4)),
+                           "cells_at_end": r.cells, "wall_s": r.wall, "drift": r.drift})
+    write("growth_3d", rows)
+
+
+@case
+def karma():
+    """Karma, Phys. Rev. Lett. 87, 115701 (2001), Figs. 1 and 2: dimensionless tip speed against time."""
+    curve = {1000: 0.0277, 2000: 0.0220, 4000: 0.0187, 5000: 0.0182, 8000: 0.0177, 9900: 0.0177}
+    rows = []
+    for ratio in (3.61, 1.84):
+        d = 0.6267 * 0.8839 * ratio
+        unit = d * ratio**2  # t D/d0^2 in one tau0
+        side = math.ceil(700 / ratio / 64) * 64
+        r = Run("karma_2001.toml", f"alloy.W0_over_d0={ratio}", f"seed[0].radius_W0={22 / ratio}",
+                f"mesh.size_W0=[{side},{side}]", f"run.end_time_tau0={10100 / unit}",
+                f"output.diagnostics_every_tau0={100 / unit}", f"output.plot_every_tau0={10100 / unit}")
+        times = sorted(r.tips[0])
+        for t, v in curve.items():
+            near = min(times, key=lambda x: abs(x * unit - t))
+            i = times.index(near)
+            lo, hi = times[max(0, i - 1)], times[min(len(times) - 1, i + 1)]
+            speed = (r.length(0, hi) - r.length(0, lo)) / (hi - lo) * ratio / unit  # V d0/D
+            rows.append({"W0_over_d0": ratio, "t_D_over_d0^2": t, "V_d0_over_D": speed, "reference": v,
+                         "difference": speed - v, "wall_s": r.wall})
+        rows[-1]["c_s_over_c_l"] = axis_concentration(r, ratio)
+    for row in rows:
+        row.setdefault("c_s_over_c_l", "")
+    write("karma_2001", rows)
+
+
+def axis_concentration(r, ratio):
+    """Mean of c_s/c_l^0 on the arm's axis from 45 d0 behind the seed to 10 d0 behind the tip."""
+    sys.path.insert(0, os.path.join(ROOT, "tools"))
+    import plotfile
+    import numpy as np
+    last = sorted(f for f in os.listdir(r.dir) if f.startswith("plt_"))[-1]
+    p = plotfile.Plotfile(os.path.join(r.dir, last))
+    w0 = r.scale["W0"]
+    tip = max(r.tips[0])
+    end = r.length(0, tip) * w0
+    x = np.linspace(60 / ratio * w0, end - 15 / ratio * w0, 200)
+    y = 0.25 * r.scale["dx"] * w0
+    values = np.array([p.sample_line("c", (xi, y), (xi, y), 1)[-1][0] for xi in x])
+    c_l = 4.0 / (1 - (1 - 0.15) * 0.55)
+    return float(np.mean(values) / c_l)
+
+
+@case
+def rotation():
+    """A whole crystal turned by 0, 15, 30, 45 degrees: tips and direction of the arms at t = 200."""
+    rows = []
+    for dx in (1.0, 0.8):
+        for angle in (0, 15, 30, 45):
+            side = 512 * dx
+            r = Run("al_cu_free.toml", *box(dx, 5, roots=2), f"seed[0].position_W0=[{side / 2},{side / 2}]",
+                    f"seed[0].angle_deg={angle}")
+            centre = (side / 2, side / 2)
+            lengths = [r.length(a, 200, centre) for a in range(4)]
+            rows.append({"dx_W0": dx, "angle_deg": angle, "tip_200": lengths[0],
+                         "error_percent": percent(lengths[0], 28.18), "arms_differ": max(lengths) - min(lengths),
+                         "off_axis_deg": max((r.tips[a][200][2] for a in range(4)), key=abs), "wall_s": r.wall})
+        first = rows[-4]["tip_200"]
+        for row in rows[-4:]:
+            row["against_0_percent"] = percent(row["tip_200"], first)
+    write("rotation", rows)
+
+
+@case
+def drift():
+    """A crystal growing in a uniform drift against the same at rest, t = 100."""
+    rows = []
+    for dx in (1.0, 0.8):
+        side = 256 * dx
+        centre = (side / 2, side / 2)
+        common = [*box(dx, 4, roots=2), f"seed[0].position_W0=[{centre[0]},{centre[1]}]", "run.end_time_tau0=105",
+                  *[f'mesh.{s}="periodic"' for s in ("xlo", "xhi", "ylo", "yhi")]]
+        rest = Run("al_cu_free.toml", *common)
+        for mode in ("material", "eulerian"):
+            for v in (0.1, 0.5):
+                r = Run("al_cu_free.toml", *common, f"flow.velocity_W0_tau0=[{v},0]", f'solute.antitrapping="{mode}"')
+                row = {"dx_W0": dx, "antitrapping": mode, "drift": v}
+                for name, arm in (("leading", 0), ("trailing", 1), ("lateral", 2)):
+                    at = lambda t: (centre[0] + v * t, centre[1])
+                    here, there = r.length(arm, 100, at(100)), rest.length(arm, 100, centre)
+                    speed = (r.length(arm, 105, at(105)) - r.length(arm, 95, at(95))) / 10
+                    row |= {f"{name}_difference_W0": here - there, f"{name}_percent": percent(here, there),
+                            f"{name}_speed_percent": percent(speed, rest.speed(arm, 100, 5, centre))}
+                rows.append(row | {"solute_drift": r.drift, "wall_s": r.wall})
+    write("drift", rows)
+
+
+@case
+def swimming():
+    """A crystal that hardly grows (U = -.01), drift .5, t = 200: radii forward and backward."""
+    rows = []
+    side = 256
+    for mode in ("material", "eulerian"):
+        r = Run("al_cu_free.toml", *box(1.0, 4, roots=2), f"seed[0].position_W0=[{side / 2},{side / 2}]",
+                "alloy.supersaturation=0.01", "flow.velocity_W0_tau0=[0.5,0]", f'solute.antitrapping="{mode}"',
+                *[f'mesh.{s}="periodic"' for s in ("xlo", "xhi", "ylo", "yhi")])
+        at = (side / 2 + 0.5 * 200, side / 2)
+        rows.append({"antitrapping": mode, "forward": r.length(0, 200, at), "backward": r.length(1, 200, at)})
+    write("swimming", rows)
+
+
+@case
+def carried():
+    """A crystal that neither grows nor dissolves, carried 20 diameters across refined and coarse mesh."""
+    rows = []
+    for dx in (1.6, 1.0, 0.8, 0.5):
+        levels = 4
+        side = 512.0
+        roots = round(side / (16 * 8 * dx))
+        t = 800.0
+        r = Run("al_cu_free.toml", f"mesh.size_W0=[{16 * 8 * dx * roots},{16 * 8 * dx * roots}]",
+                f"mesh.root_blocks=[{roots},{roots}]", f"mesh.levels={levels}",
+                "seed[0].position_W0=[64,64]", "phase_field.frozen=true", f"flow.velocity_W0_tau0=[0.4,0.3]",
+                f"run.end_time_tau0={t}", "output.diagnostics_every_tau0=100", "output.plot_every_tau0=800",
+                *[f'mesh.{s}="periodic"' for s in ("xlo", "xhi", "ylo", "yhi")])
+        box_side = 16 * 8 * dx * roots
+        at = [64 + 0.4 * t, 64 + 0.3 * t]
+        radii = [math.dist(r.tips[a][t][0], at) for a in range(4)]
+        before, after = r.diagnostics[0], r.diagnostics[-1]
+        extremes = composition(r)
+        rows.append({"dx_W0": dx, "radius_min": min(radii), "radius_max": max(radii),
+                     "area_change_percent": percent(float(after["solid_fraction"]), float(before["solid_fraction"])),
+                     "U_min": extremes[0], "U_max": extremes[1], "U_rms_error": extremes[2], "solute_drift": r.drift,
+                     "steps": r.steps, "wall_s": r.wall})
+    write("carried", rows)
+
+
+def composition(r):
+    """Extremes of U and its rms deviation from -Omega where there is interface or solid (phi > -.9)."""
+    sys.path.insert(0, os.path.join(ROOT, "tools"))
+    import plotfile
+    import numpy as np
+    last = sorted(f for f in os.listdir(r.dir) if f.startswith("plt_"))[-1]
+    p = plotfile.Plotfile(os.path.join(r.dir, last))
+    u, phi = p.uniform("U")[0], p.uniform("phi")[0]
+    return float(u.min()), float(u.max()), float(np.sqrt(np.mean((u[phi > -0.9] + 0.2) ** 2)))
+
+
+@case
+def width():
+    """W0/d0 = 5 ... 30 at the same physical seed and time (.05 s)."""
+    rows = []
+    base = None
+    for ratio in (5, 10, 15, 20, 30):
+        for dx in (1.0, 0.8):
+            d0 = 0.0214357
+            w0 = ratio * d0
+            r = Run("al_cu_free.toml", f"alloy.W0_over_d0={ratio}", f"seed[0].radius_W0={100 / ratio}",
+                    *box(dx, 7 if ratio >= 10 else 8), "run.end_time_s=0.05", "output.diagnostics_every_s=0.0025")
+            last = max(r.tips[0])
+            tip = r.length(0, last) * w0
+            rows.append({"W0_over_d0": ratio, "dx_W0": dx, "tip_um": tip, "steps": r.steps, "cells_at_end": r.cells,
+                         "wall_s": r.wall})
+    finest = next(row["tip_um"] for row in rows if row["W0_over_d0"] == 5 and row["dx_W0"] == 0.8)
+    for row in rows:
+        row["against_5_percent"] = percent(row["tip_um"], finest)
+    write("width", rows)
+
+
+def main():
+    global ARGS
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("cases", nargs="*", metavar="CASE")
+    parser.add_argument("--build", default=os.path.join(ROOT, "build", "release"))
+    parser.add_argument("--ranks", type=int, default=1)
+    parser.add_argument("--keep", action="store_true", help="leave the last run in out/verify")
+    ARGS = parser.parse_args()
+    if not ARGS.cases:
+        for name, f in CASES.items():
+            print(f"{name:12s} {f.__doc__}")
+        return
+    for name in CASES if ARGS.cases == ["all"] else ARGS.cases:
+        if name not in CASES:
+            parser.error(f"no case {name}; there are {', '.join(CASES)}")
+        CASES[name]()
+
+
+if __name__ == "__main__":
+    main()
