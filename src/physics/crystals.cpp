@@ -9,7 +9,7 @@ namespace dendrift::physics {
 
 namespace {
 
-constexpr double NOWHERE = -1e30;
+constexpr double NOWHERE = 1e30;
 constexpr int SIDE_POINTS = 6;  // on each side of the axis, for the parabola
 
 RealVec along(const RealVec& origin, const RealVec& direction, double s) {
@@ -70,11 +70,10 @@ class Probe {
     return sum;
   }
 
-  // Largest s in [first, last] at which psi changes from solid to liquid along the ray, as far as this rank sees;
+  // Smallest s in [first, last] at which psi changes from solid to liquid along the ray, as far as this rank sees;
   // each interval of half a cell belongs to the block that holds its beginning.
-  double last_crossing(const RealVec& origin, const RealVec& direction, double first, double last) const {
+  double first_crossing(const RealVec& origin, const RealVec& direction, double first, double last) const {
     const double h = 0.5 * mesh_.shape().dx(mesh_.shape().max_level);
-    double found = NOWHERE;
     for (std::int64_t i = 0; first + static_cast<double>(i) * h < last; ++i) {
       const double s = first + static_cast<double>(i) * h;
       RealVec shift;
@@ -87,9 +86,9 @@ class Probe {
         const double middle = 0.5 * (lo + hi);
         (value(b, along(o, direction, middle)) > 0 ? lo : hi) = middle;
       }
-      found = std::max(found, 0.5 * (lo + hi));
+      return 0.5 * (lo + hi);
     }
-    return found;
+    return NOWHERE;
   }
 
  private:
@@ -115,8 +114,8 @@ std::vector<RealVec> sides_of(const RealVec& d, const Seed& crystal) {
   return sides;
 }
 
-void reduce_max(std::vector<double>& values, MPI_Comm comm) {
-  MPI_Allreduce(MPI_IN_PLACE, values.data(), static_cast<int>(values.size()), MPI_DOUBLE, MPI_MAX, comm);
+void reduce_min(std::vector<double>& values, MPI_Comm comm) {
+  MPI_Allreduce(MPI_IN_PLACE, values.data(), static_cast<int>(values.size()), MPI_DOUBLE, MPI_MIN, comm);
 }
 
 // Least squares parabola through the crossings: position = apex - (offset - shift)^2 / (2 radius).
@@ -163,17 +162,17 @@ std::vector<Tip> find_tips(const amr::Mesh& mesh, amr::CellField psi, const std:
       if (arm % 2 == 1)
         for (double& d : t.direction) d = -d;
       tips.push_back(t);
-      lengths.push_back(probe.last_crossing(crystals[g].position, t.direction, 0, reach));
+      lengths.push_back(probe.first_crossing(crystals[g].position, t.direction, 0, reach));
     }
   }
-  reduce_max(lengths, mesh.comm());
+  reduce_min(lengths, mesh.comm());
   std::vector<Ray> rays;
   for (std::size_t i = 0; i < tips.size(); ++i) {
     Tip& t = tips[i];
     const Seed& crystal = crystals[static_cast<std::size_t>(t.grain)];
-    t.length = std::max(0.0, lengths[i]);
-    t.position = along(crystal.position, t.direction, t.length);
     if (lengths[i] == NOWHERE) continue;
+    t.length = lengths[i];
+    t.position = along(crystal.position, t.direction, t.length);
     for (const RealVec& side : sides_of(t.direction, crystal))
       for (int m = -SIDE_POINTS; m <= SIDE_POINTS; ++m) {
         const double offset = m * TIP_WINDOW / SIDE_POINTS;
@@ -183,9 +182,9 @@ std::vector<Tip> find_tips(const amr::Mesh& mesh, amr::CellField psi, const std:
   std::vector<double> crossings;
   for (const Ray& r : rays) {
     const Tip& t = tips[r.tip];
-    crossings.push_back(probe.last_crossing(r.origin, t.direction, std::max(0.0, t.length - 2 * TIP_WINDOW), t.length + 1));
+    crossings.push_back(probe.first_crossing(r.origin, t.direction, std::max(0.0, t.length - 2 * TIP_WINDOW), t.length + 1));
   }
-  reduce_max(crossings, mesh.comm());
+  reduce_min(crossings, mesh.comm());
   for (std::size_t i = 0; i < rays.size(); ++i) rays[i].crossing = crossings[i];
   for (std::size_t i = 0; i < tips.size(); ++i) {
     const Parabola p = fitted_parabola(rays, i);

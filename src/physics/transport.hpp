@@ -2,20 +2,23 @@
 /// The flow carries phase and solute: v.grad phi of eq. (1) and div(v c) of eq. (2).
 #pragma once
 
+#include <memory>
+
 #include "amr/flux_register.hpp"
-#include "physics/alloy_kernel.hpp"
 #include "physics/module.hpp"
 
 namespace dendrift::physics {
 
-/// psi, smooth across the interface, is carried along characteristics by cubic interpolation. c moves by fluxes, so
-/// that no solute is lost: flux = v A(phi_f) [1+(1-k) U_f], A = [1+k-(1-k)phi]/2, with phi_f taken from psi at the
-/// middle of the step and corrected to fourth order, so that c follows phi and a uniform U stays uniform.
+/// Third-order upwind in space, three-stage Runge-Kutta in time (Wicker & Skamarock, Mon. Weather Rev. 130, 2088
+/// (2002)). psi, smooth across the interface, is carried as it is. c moves by fluxes, so that no solute is lost:
+/// flux = v A(phi_f) [1+(1-k) U_f], A = [1+k-(1-k)phi]/2, with A(phi_f) taken from psi to fourth order, so that c
+/// follows phi and a uniform U stays uniform, and U_f limited (Koren), so that U makes no new extremes.
 /// Reads the face field "velocity" and the cell fields psi and c.
 class Transport : public Module {
  public:
   explicit Transport(double partition_coefficient) : k_(partition_coefficient) {}
   const char* name() const override { return "transport"; }
+  void declare(amr::FieldTable& fields) override;
   void attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) override;
   void initialize() override { after_regrid(); }
   void after_regrid() override;
@@ -24,11 +27,16 @@ class Transport : public Module {
   double front_speed() const override { return fastest_; }
 
  private:
-  void carry_phase(int b, double dt) const;
-  void carry_solute(int b, double dt);
+  /// Phase and solute of one moment of a step.
+  struct Moment {
+    amr::CellField psi, c;
+  };
+  void stage(const Moment& base, const Moment& from, const Moment& to, double dt);
+  void carry_phase(int b, const Moment& base, const Moment& from, const Moment& to, double dt) const;
+  void carry_solute(int b, const Moment& base, const Moment& from, const Moment& to, double dt);
 
   double k_;
-  amr::CellField psi_, c_, psi_other_, c_other_;
+  Moment now_, first_, second_;
   amr::FaceField v_;
   amr::Mesh* mesh_ = nullptr;
   amr::GhostExchange* ghosts_ = nullptr;
