@@ -82,6 +82,7 @@ void Simulation::build_initial_mesh() {
   for (const auto& m : modules_) m->initialize();
   adapt(1.0);  // spread the final mesh by the partitioner of choice
   for (const auto& m : modules_) m->after_regrid();
+  schedule_regrid();
 }
 
 void Simulation::resume(const std::string& file) {
@@ -108,6 +109,9 @@ void Simulation::resume(const std::string& file) {
     for (int a = 0; a < DIM; ++a) crystals_[g].position[a] = positions.at(g * DIM + at(a));
   for (const auto& [name, values] : s.numbers)
     if (name.starts_with("tip.")) last_tips_[name.substr(4)] = values;
+  for (const auto& m : modules_)
+    if (const auto memory = s.numbers.find(std::string("module.") + m->name()); memory != s.numbers.end())
+      m->recall(memory->second);
   resumed_ = true;
   for (const auto& m : modules_) m->after_regrid();
 }
@@ -125,6 +129,7 @@ io::RunState Simulation::state() const {
   s.numbers["initial_solute"] = {initial_solute_};
   for (const physics::Seed& g : crystals_)
     s.numbers["crystal_positions"].insert(s.numbers["crystal_positions"].end(), g.position.begin(), g.position.end());
+  for (const auto& m : modules_) s.numbers[std::string("module.") + m->name()] = m->memory();
   for (const auto& [name, values] : last_tips_) s.numbers["tip." + name] = values;
   return s;
 }
@@ -140,13 +145,13 @@ bool Simulation::adapt(double max_imbalance) {
   return amr::regrid(*mesh_, *ghosts_, proposal, {settings_.parallel.partitioner, max_imbalance});
 }
 
-void Simulation::schedule_regrid(double dt) {
+void Simulation::schedule_regrid() {
   double speed = 0;
   ghosts_->fill({psi_, c_});
   for (const auto& m : modules_) speed += m->front_speed();
   // Half the buffer, so that the front may double its speed before the next look.
   const double way = 0.5 * (settings_.phase_field.buffer_cells - 1) * mesh_->shape().dx(mesh_->shape().max_level);
-  const double steps = speed > 0 ? way / (speed * dt) : settings_.mesh.max_regrid_steps;
+  const double steps = speed > 0 ? way / (speed * max_dt()) : settings_.mesh.max_regrid_steps;
   next_regrid_ = step_ + std::clamp(static_cast<std::int64_t>(std::min(steps, 1e6)), std::int64_t{1},
                                     std::int64_t{settings_.mesh.max_regrid_steps});
 }
@@ -159,18 +164,17 @@ double Simulation::max_dt() const {
 }
 
 void Simulation::step(double dt) {
-  if (step_ >= next_regrid_) {
-    clock_.time("regrid", [&] {
-      if (adapt(settings_.parallel.max_imbalance))
-        for (const auto& m : modules_) m->after_regrid();
-      schedule_regrid(dt);
-    });
-  }
   for (const auto& m : modules_) clock_.time(m->name(), [&] { m->advance(time_, dt, step_); });
   for (physics::Seed& g : crystals_)
     for (int a = 0; a < DIM; ++a) g.position[a] += dt * drift_[a];
   time_ += dt;
   ++step_;
+  if (step_ < next_regrid_) return;
+  clock_.time("regrid", [&] {
+    if (adapt(settings_.parallel.max_imbalance))
+      for (const auto& m : modules_) m->after_regrid();
+    schedule_regrid();
+  });
 }
 
 double Simulation::next_stop() const {

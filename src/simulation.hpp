@@ -86,7 +86,7 @@ class Simulation {
   void build_initial_mesh();
   void resume(const std::string& path);
   bool adapt(double max_imbalance);
-  void schedule_regrid(double dt);
+  void schedule_regrid();
   double next_stop() const;
   void check_finite(const Totals& t) const;
 

@@ -11,13 +11,14 @@ namespace {
 class FailuresOfRank : public ::testing::EmptyTestEventListener {
  public:
   explicit FailuresOfRank(int rank) : rank_(rank) {}
-  void OnTestPartResult(const ::testing::TestPartResult& result) override {
+  void OnTestStart(const ::testing::TestInfo& test) override {
+    test_ = std::string(test.test_suite_name()) + "." + test.name();
+  }
+  void OnTestPartResult(const ::testing::TestPartResult& result) override {  // GoogleTest is locked meanwhile
     if (!result.failed()) return;
-    const ::testing::TestInfo* test = ::testing::UnitTest::GetInstance()->current_test_info();
-    std::string text = "[rank " + std::to_string(rank_) + "] ";
-    if (test != nullptr) text += std::string(test->test_suite_name()) + "." + test->name() + " ";
+    std::string text = "[rank " + std::to_string(rank_) + "] " + test_;
     if (result.file_name() != nullptr) {
-      text += std::string(result.file_name()) + ":" + std::to_string(result.line_number());
+      text += std::string(" ") + result.file_name() + ":" + std::to_string(result.line_number());
     }
     text += std::string(": Failure\n") + result.message() + "\n";
     std::fputs(text.c_str(), stdout);
@@ -26,6 +27,7 @@ class FailuresOfRank : public ::testing::EmptyTestEventListener {
 
  private:
   int rank_;
+  std::string test_ = "outside of tests";
 };
 
 }  // namespace

@@ -44,7 +44,7 @@ def mentions(text):
 def has_function(text, name):
     """Whether the source declares or defines the function: its name after a type and before a bracket."""
     code = COMMENT.sub(" ", text)
-    return re.search(rf"[\w>&*\]]{NOT_A_TYPE}[\s&*]+{re.escape(name)}\s*\(", code) is not None
+    return re.search(rf"[\w>&*\]]{NOT_A_TYPE}[\s&*]+(?:\w+::)*{re.escape(name)}\s*\(", code) is not None
 
 
 class Section:

@@ -112,7 +112,7 @@ def growth():
 def growth_dt():
     """Row 1 at dx = 1: error of the time step against the smallest one."""
     rows = []
-    for dt in (0.05, 0.1, 0.2, 0.3, 0.4):
+    for dt in (0.03, 0.06, 0.12, 0.24, 0.3):
         r = Run("al_cu_free.toml", *box(1.0, 7), f"phase_field.max_dt_tau0={dt}")
         rows.append({"max_dt_tau0": dt, "tip_100": r.length(0, 100), "tip_200": r.length(0, 200), "steps": r.steps,
                      "wall_s": r.wall})
@@ -145,20 +145,20 @@ def karma():
     """Karma, Phys. Rev. Lett. 87, 115701 (2001), Figs. 1 and 2: dimensionless tip speed against time."""
     curve = {1000: 0.0277, 2000: 0.0220, 4000: 0.0187, 5000: 0.0182, 8000: 0.0177, 9900: 0.0177}
     rows = []
-    for ratio in (3.61, 1.84):
+    for ratio, dx in ((3.61, 1.0), (3.61, 0.5), (1.84, 1.0), (1.84, 0.5)):
         d = 0.6267 * 0.8839 * ratio
         unit = d * ratio**2  # t D/d0^2 in one tau0
         side = math.ceil(700 / ratio / 64) * 64
         r = Run("karma_2001.toml", f"alloy.W0_over_d0={ratio}", f"seed[0].radius_W0={22 / ratio}",
-                f"mesh.size_W0=[{side},{side}]", f"run.end_time_tau0={10100 / unit}",
+                f"mesh.size_W0=[{side},{side}]", f"mesh.dx_W0={dx}", f"run.end_time_tau0={10100 / unit}",
                 f"output.diagnostics_every_tau0={100 / unit}", f"output.plot_every_tau0={10100 / unit}")
         times = sorted(r.tips[0])
         for t, v in curve.items():
             near = min(times, key=lambda x: abs(x * unit - t))
             i = times.index(near)
-            lo, hi = times[max(0, i - 1)], times[min(len(times) - 1, i + 1)]
+            lo, hi = times[max(0, i - 2)], times[min(len(times) - 1, i + 2)]
             speed = (r.length(0, hi) - r.length(0, lo)) / (hi - lo) * ratio / unit  # V d0/D
-            rows.append({"W0_over_d0": ratio, "t_D_over_d0^2": t, "V_d0_over_D": speed, "reference": v,
+            rows.append({"W0_over_d0": ratio, "dx_W0": dx, "t_D_over_d0^2": t, "V_d0_over_D": speed, "reference": v,
                          "difference": speed - v, "wall_s": r.wall})
         rows[-1]["c_s_over_c_l"] = axis_concentration(r, ratio)
     for row in rows:
@@ -223,6 +223,18 @@ def drift():
                     speed = (r.length(arm, 105, at(105)) - r.length(arm, 95, at(95))) / 10
                     row |= {f"{name}_difference_W0": here - there, f"{name}_percent": percent(here, there),
                             f"{name}_speed_percent": percent(speed, rest.speed(arm, 100, 5, centre))}
+                    x, radius, lean = r.tips[2][100]
+                length = r.length(2, 100, at(100))
+                # The apex of the parabola: a leaning arm is longer than its section with the axis.
+                row["lateral_lean_deg"] = lean
+                row["lateral_apex_percent"] = percent(
+                    length + (length * math.tan(math.radians(lean))) ** 2 / (2 * radius), rest.length(2, 100, centre))
+                x, radius, lean = r.tips[2][100]
+                length = r.length(2, 100, at(100))
+                # The apex of the parabola: a leaning arm is longer than its section with the axis.
+                row["lateral_lean_deg"] = lean
+                row["lateral_apex_percent"] = percent(
+                    length + (length * math.tan(math.radians(lean))) ** 2 / (2 * radius), rest.length(2, 100, centre))
                 rows.append(row | {"solute_drift": r.drift, "wall_s": r.wall})
     write("drift", rows)
 
@@ -287,8 +299,9 @@ def width():
         for dx in (1.0, 0.8):
             d0 = 0.0214357
             w0 = ratio * d0
+            end = 0.05 / ((0.6267 * 0.8839 * ratio) * w0**2 / 2400)  # .05 s
             r = Run("al_cu_free.toml", f"alloy.W0_over_d0={ratio}", f"seed[0].radius_W0={100 / ratio}",
-                    *box(dx, 7 if ratio >= 10 else 8), "run.end_time_s=0.05", "output.diagnostics_every_s=0.0025")
+                    *box(dx, 7 if ratio >= 10 else 8), f"run.end_time_tau0={end}", f"output.diagnostics_every_tau0={end / 20}")
             last = max(r.tips[0])
             tip = r.length(0, last) * w0
             rows.append({"W0_over_d0": ratio, "dx_W0": dx, "tip_um": tip, "steps": r.steps, "cells_at_end": r.cells,

@@ -37,8 +37,11 @@ class Module {
   virtual void before_tagging() {}
   /// Raises what local block b asks of the next mesh. Ghosts of the fields are filled.
   virtual void tag(int /*b*/, amr::Tag&) const {}
-  /// Speed at which what tag() looks at travels through the mesh. The same on all ranks.
-  virtual double front_speed() const { return 0; }
+  /// Speed at which what tag() looks at travels through the mesh. Ghosts are filled. Collective; the same on all ranks.
+  virtual double front_speed() { return 0; }
+  /// What a restart must know beside the fields, and giving it back.
+  virtual std::vector<double> memory() const { return {}; }
+  virtual void recall(const std::vector<double>&) {}
 };
 
 using Modules = std::vector<std::unique_ptr<Module>>;

@@ -12,7 +12,7 @@ void PhaseFieldOptions::declare(io::Schema& schema) {
   io::Table& t = schema.table("phase_field", "Karma's phase field, eq. (1)", io::Schema::Presence::implied);
   t.real("anisotropy", anisotropy).range(0, 0.06).doc("eps4 of a_s = (1-3 eps)(1 + 4 eps/(1-3 eps) sum n_i^4); convex below 1/15");
   t.boolean("frozen", frozen).doc("no growth and no diffusion: crystals are only carried by the flow");
-  t.real("max_dt_tau0", max_dt_tau0).unit("tau0").above(0).at_most(1).doc("largest step of phase and solute; stable up to about .45");
+  t.real("max_dt_tau0", max_dt_tau0).unit("tau0").above(0).at_most(1).doc("largest step of phase and solute; stable below about .3, whatever the spacing");
   t.real("noise", noise).at_least(0).at_most(10).doc("amplitude of a uniform random rate of psi in the interface, per sqrt(tau0 W0^d); 0: none");
   t.integer("noise_seed", noise_seed).doc("of the counter-based generator");
   t.real("refine_gradient_W0", refine_gradient_w0)

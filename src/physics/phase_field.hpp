@@ -12,7 +12,7 @@ namespace dendrift::physics {
 struct PhaseFieldOptions {
   double anisotropy = 0.05;
   bool frozen = false;
-  double max_dt_tau0 = 0.4;
+  double max_dt_tau0 = 0.24;
   double noise = 0;
   std::int64_t noise_seed = 1;
   double refine_gradient_w0 = 0.015;

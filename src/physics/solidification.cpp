@@ -44,15 +44,44 @@ void Solidification::initialize() {
   });
 }
 
-int Solidification::stages(double dt, double dx) const {
+double Solidification::explicit_limit(double dx) const {
   // Largest eigenvalues: 4 DIM D/dx^2 of the solute's 2 DIM + 1 point Laplacian; for the phase the stiffness
   // (a_s + a_s'')/a_s across the interface times the isotropic Laplacian's 16/3 (2D) or 8 (3D).
   const double eps = phase_.anisotropy;
   const double stiffness = (1 + 15 * eps) / (1 - eps);
-  const double largest = std::max(4.0 * DIM * parameters_.diffusivity, (DIM == 2 ? 16.0 / 3 : 8.0) * stiffness) / (dx * dx);
+  const double largest = std::max(4.0 * DIM * parameters_.diffusivity, (DIM == 2 ? 16.0 / 3 : 8.0) * stiffness);
   constexpr double SAFETY = 0.9;
-  const double euler_steps = dt * largest / (2 * SAFETY);
-  return std::max(1, static_cast<int>(std::ceil(0.5 * (std::sqrt(1 + 8 * euler_steps) - 1) - 1e-12)));
+  return 2 * SAFETY * dx * dx / largest;
+}
+
+int Solidification::stages(double dt, double dx) const {
+  const double euler_steps = dt / explicit_limit(dx);
+  return std::max(1, static_cast<int>(std::ceil(0.5 * (std::sqrt(1 + 8 * euler_steps) - 1) - 1e-9)));
+}
+
+double Solidification::sharpening_limit() const {
+  // The term sqrt2 phi (1 - a_s^2 |grad psi|^2) carries disturbances of psi away from the interface at a speed of
+  // 2 sqrt2 |grad psi|; diffusion of unit strength then keeps a step of first order stable up to
+  // 1/(4 |grad psi|^2), whatever the spacing. Ahead of a front of speed V, |grad psi| = (V + sqrt(V^2+8))/sqrt 8.
+  const double gradient = (fastest_ + std::sqrt(fastest_ * fastest_ + 8)) / std::sqrt(8.0);
+  return 0.27 / (gradient * gradient);
+}
+
+double Solidification::max_dt() const {
+  if (phase_.frozen) return 1e30;
+  // A step a little shorter may need a stage less: take the number of stages that costs least per unit of time.
+  const double dx = mesh_->shape().dx(mesh_->shape().max_level);
+  const double limit = std::min(phase_.max_dt_tau0, sharpening_limit());
+  const int most = stages(limit, dx);
+  double best = limit, rate = most / best;
+  for (int s = 1; s < most; ++s) {
+    const double dt = explicit_limit(dx) * (s * s + s) / 2;
+    if (s / dt < rate) {
+      rate = s / dt;
+      best = dt;
+    }
+  }
+  return best;
 }
 
 AlloyBlock Solidification::block_arrays(int b) const {
@@ -124,7 +153,7 @@ void Solidification::tag(int b, amr::Tag& tag) const {
   tag.weight = kind_cost_[static_cast<std::size_t>(classify(mesh_->cells(psi_, b), mesh_->layout().n))];
 }
 
-double Solidification::front_speed() const {
+double Solidification::front_speed() {
   if (phase_.frozen) return 0;
   const int n = mesh_->layout().n;
   const double band = phase_.band();
@@ -142,7 +171,8 @@ double Solidification::front_speed() const {
       ++r;
     });
   });
-  return amr::global_max(fastest.empty() ? 0 : *std::max_element(fastest.begin(), fastest.end()), mesh_->comm());
+  fastest_ = amr::global_max(fastest.empty() ? 0 : *std::max_element(fastest.begin(), fastest.end()), mesh_->comm());
+  return fastest_;
 }
 
 }  // namespace dendrift::physics

@@ -25,14 +25,19 @@ class Solidification : public Module {
   void attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) override;
   void initialize() override;
   void after_regrid() override { initializing_ = false; }
-  double max_dt() const override { return phase_.frozen ? 1e30 : phase_.max_dt_tau0; }
+  double max_dt() const override;
   void advance(double t, double dt, std::int64_t step) override;
   void before_tagging() override;
   void tag(int b, amr::Tag& tag) const override;
-  double front_speed() const override;
+  double front_speed() override;
+  std::vector<double> memory() const override { return {fastest_}; }
+  void recall(const std::vector<double>& m) override { fastest_ = m.at(0); }
 
-  /// Stages that a step of dt takes on a mesh whose finest spacing is dx.
+  /// Stages that a step of dt takes on a mesh whose finest spacing is dx, and the largest step of one stage.
   int stages(double dt, double dx) const;
+  double explicit_limit(double dx) const;
+  /// Largest stable step of the phase, from the speed of the front when the mesh was last looked at.
+  double sharpening_limit() const;
   const AlloyParameters& parameters() const { return parameters_; }
 
  private:
@@ -50,6 +55,7 @@ class Solidification : public Module {
   amr::GhostExchange* ghosts_ = nullptr;
   std::unique_ptr<amr::FluxRegister> fluxes_;
   bool initializing_ = true;
+  double fastest_ = 0;  // rate of psi in the interface when last looked at: the speed of the front
   std::vector<std::array<double, 2>> block_cost_;  // seconds, kind; of this rank's blocks
   std::array<double, 3> kind_cost_{0.2, 0.1, 1.0};  // relative cost of a block by BlockKind, measured
 };

@@ -24,7 +24,7 @@ class Transport : public Module {
   void after_regrid() override;
   double max_dt() const override;
   void advance(double t, double dt, std::int64_t step) override;
-  double front_speed() const override { return fastest_; }
+  double front_speed() override { return fastest_; }
 
  private:
   /// Phase and solute of one moment of a step.

@@ -278,8 +278,7 @@ class Oracle {
       const amr::SideRule rule = mesh_.fields().row(field_.id).sides[2 * a + (cell[a] < 0 ? 0 : 1)];
       IntVec mirror = cell;
       mirror[a] = cell[a] < 0 ? -1 - cell[a] : 2 * extent - 1 - cell[a];
-      const double inside = value(level, mirror);
-      return rule.kind == amr::SideRule::Kind::even ? inside : 2 * rule.value - inside;
+      return rule.kind == amr::SideRule::Kind::even ? value(level, mirror) : rule.value;
     }
     amr::BlockIndex node{level, {}};
     IntVec local{};
