@@ -44,7 +44,11 @@ end_time_tau0 = 6
 plot_every_tau0 = 3
 diagnostics_every_tau0 = 1
 """
-PARTITION_COEFFICIENT, SUPERSATURATION, C0 = 0.14, 0.2, 4.0  # defaults of [alloy]
+# Defaults of [alloy], and what follows: wt% in the liquid at the interface, um per W0.
+K, SUPERSATURATION, C0_WT, SLOPE, GIBBS_THOMSON, W0_OVER_D0 = 0.14, 0.2, 4.0, 2.65, 0.236, 10
+C_L = C0_WT / (1 - (1 - K) * SUPERSATURATION)
+W0_UM = W0_OVER_D0 * GIBBS_THOMSON / (SLOPE * C_L * (1 - K))
+SIZE_W0 = {2: [128, 64], 3: [64, 64, 32]}
 SUM_TOLERANCE = 1e-9  # yt adds 1e4 to 1e5 numbers one after the other, with errors of 1e-16 each
 
 
@@ -57,7 +61,7 @@ def check_plotfile(path, dim, rows, ranks):
     require(type(ds).__name__ == "ChomboDataset", f"{path.name}: yt takes it for a {type(ds).__name__}")
     data = ds.all_data()
     field = {name: np.asarray(data["chombo", name]) for _, name in ds.field_list}
-    row = rows[int(ds.parameters.get("iteration", path.stem.split("_")[1]))]
+    row = rows[int(path.stem.split("_")[1])]
     where = f"{path.name} ({dim}D)"
 
     velocities = ["velocity_x", "velocity_y", "velocity_z"][:dim]
@@ -67,8 +71,7 @@ def check_plotfile(path, dim, rows, ranks):
         require(np.isfinite(values).all(), f"{where}: {name} is not finite everywhere")
 
     cell_level = np.asarray(data["index", "grid_level"]).astype(int)
-    cells, blocks = len(cell_level), 0
-    side = 8
+    cells, blocks, side = len(cell_level), 0, 8
     require(cells == int(row["cells"]), f"{where}: {cells} cells, diagnostics.csv has {row['cells']}")
     for level in range(ds.index.max_level + 1):
         count = int((cell_level == level).sum())
@@ -87,6 +90,8 @@ def check_plotfile(path, dim, rows, ranks):
 
     volume = np.prod([np.asarray(data["index", "d" + axis]) for axis in "xyz"[:dim]], axis=0)
     box = float(np.prod(np.asarray(ds.domain_width)[:dim]))
+    width = np.asarray(ds.domain_width)[:dim]
+    require(np.allclose(width, W0_UM * np.array(SIZE_W0[dim]), rtol=1e-12), f"{where}: a box of {width} um")
     require(relative(volume.sum(), box) < SUM_TOLERANCE, f"{where}: the leaves do not fill the box")
     means = {"solid_fraction": (volume * 0.5 * (1 + field["phi"])).sum() / box,
              "solute_mean_wt": (volume * field["c"]).sum() / box}
@@ -96,11 +101,9 @@ def check_plotfile(path, dim, rows, ranks):
     require(relative(float(ds.current_time) + 1, float(row["time_s"]) + 1) < 1e-15, f"{where}: time {ds.current_time}")
 
     # U, c and phi are one state: c/c_l = (1 + k - (1-k) phi)/2 [1 + (1-k) U].
-    k = PARTITION_COEFFICIENT
-    c_l = C0 / (1 - (1 - k) * SUPERSATURATION)
-    c = c_l * 0.5 * (1 + k - (1 - k) * field["phi"]) * (1 + (1 - k) * field["U"])
+    c = C_L * 0.5 * (1 + K - (1 - K) * field["phi"]) * (1 + (1 - K) * field["U"])
     require(np.abs(c / field["c"] - 1).max() < 1e-12, f"{where}: U, c and phi contradict each other")
-    return box, cells, len(ds.index.grids)
+    return cells, len(ds.index.grids)
 
 
 def main():
@@ -115,8 +118,8 @@ def main():
         files = [folder / "out" / entry["name"] for entry in series["files"]]
         require(len(files) == 3, f"{dim}D: {len(files)} plotfiles, three were asked for")
         seen = [check_plotfile(file, dim, rows, 2) for file in files]
-        require(len({s[1] for s in seen}) > 1, f"{dim}D: the mesh never changed")
-        say(f"{dim}D: {len(files)} plotfiles, {seen[-1][1]} cells, {seen[-1][2]} blocks in the last: fields, integrals, "
+        require(len({cells for cells, _ in seen}) > 1, f"{dim}D: the mesh never changed")
+        say(f"{dim}D: {len(files)} plotfiles, {seen[-1][0]} cells, {seen[-1][1]} blocks in the last: fields, integrals, "
             "counts, time and U(c, phi) as in diagnostics.csv")
 
 

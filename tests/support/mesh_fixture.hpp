@@ -286,7 +286,7 @@ class Oracle {
       node.coord[a] = cell[a] / n;
       local[a] = cell[a] % n;
     }
-    const int leaf = mesh_.tree().locate(node);
+    const int leaf = locate(node);
     if (mesh_.tree().leaf(leaf) == node) {
       return mesh_.cells(field_, mesh_.local(leaf))[mesh_.layout().offset(local)];
     }
@@ -302,10 +302,19 @@ class Oracle {
       if (cell[a] < 0 || cell[a] >= extent) return 2;
       node.coord[a] = cell[a] / mesh_.layout().n;
     }
-    return mesh_.tree().leaf(mesh_.tree().locate(node)).level - level;
+    return mesh_.tree().leaf(locate(node)).level - level;
   }
 
  private:
+  int locate(const amr::BlockIndex& node) const {  // most questions follow one about the same block
+    amr::BlockIndex& asked = asked_[static_cast<std::size_t>(node.level % 2)];
+    int& answer = answer_[static_cast<std::size_t>(node.level % 2)];
+    if (answer < 0 || node != asked) {
+      asked = node;
+      answer = mesh_.tree().locate(node);
+    }
+    return answer;
+  }
   double mean_of_children(int level, const IntVec& cell) const {
     double sum = 0;
     for (int child = 0; child < CHILDREN; ++child) {
@@ -329,6 +338,8 @@ class Oracle {
 
   const amr::Mesh& mesh_;
   amr::CellField field_;
+  mutable std::array<amr::BlockIndex, 2> asked_;  // one for odd levels, one for even ones
+  mutable std::array<int, 2> answer_{-1, -1};
 };
 
 /// Place of a block's cell in the numbering that Oracle uses.
