@@ -11,6 +11,10 @@ namespace {
 
 constexpr int GHOSTS = 2;
 
+// Bound of a_s^2 |grad psi|^2 in the term that restores it to 1. Fronts slower than 2 W0/tau0 stay below; what is
+// steeper (seeds that cut each other) then flattens at a bounded rate instead of outrunning the time step.
+constexpr double STEEPEST = 4.0;
+
 // Strides of a block of N cells a side, known to the compiler.
 template <int N>
 struct Shape {
@@ -197,7 +201,7 @@ void phase_rate(const double* psi, const AlloyParameters& par, double dx, Scratc
                        4.0 * e4 * a * (3.0 * nnm - sum4 * d.laplacian - 2.0 * sum4 * nmn - 4.0 * wmn);
     const double t = t_[q], phi = 1.0 - 2.0 * t;
     const double r =
-        ratio * ratio * (div + SQRT2 * phi * (1.0 - a * a * p2) - drive * 4.0 * t * (1.0 - t) * u_[q]);
+        ratio * ratio * (div + SQRT2 * phi * (1.0 - std::min(a * a * p2, STEEPEST)) - drive * 4.0 * t * (1.0 - t) * u_[q]);
     const bool held = (psi[q] >= PSI_MAX && r > 0) || (psi[q] <= -PSI_MAX && r < 0);
     rate_[q] = held ? 0.0 : r;
   }

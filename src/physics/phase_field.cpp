@@ -42,12 +42,16 @@ void set_seeds(amr::Mesh& mesh, amr::CellField psi, const std::vector<Seed>& see
   const amr::Block& block = mesh.block(b);
   const amr::Layout& layout = mesh.layout();
   double* p = mesh.cells(psi, b);
+  const Array<bool> periodic = mesh.shape().periodic();
+  RealVec extent = mesh.shape().hi();
+  for (int a = 0; a < DIM; ++a) extent[a] -= mesh.shape().lo[a];
   amr::for_each_cell({}, filled(layout.n), [&](const IntVec& c) {
     double value = -PSI_MAX;
     for (const Seed& s : seeds) {
       double r2 = 0;
       for (int a = 0; a < DIM; ++a) {
-        const double x = block.lo[a] + (c[a] + 0.5) * block.dx - s.position[a];
+        double x = block.lo[a] + (c[a] + 0.5) * block.dx - s.position[a];
+        if (periodic[a]) x -= std::round(x / extent[a]) * extent[a];  // the nearest image
         r2 += x * x;
       }
       value = std::max(value, s.radius - std::sqrt(r2));
@@ -92,7 +96,12 @@ void tag_seeds(const amr::Mesh& mesh, const std::vector<Seed>& seeds, double ban
   for (const Seed& s : seeds) {
     double near2 = 0, far2 = 0;
     for (int a = 0; a < DIM; ++a) {
-      const double lo = block.lo[a] - s.position[a], hi = lo + side;
+      double lo = block.lo[a] - s.position[a];
+      if (mesh.shape().periodic()[a]) {
+        const double extent = mesh.shape().hi()[a] - mesh.shape().lo[a];
+        lo -= std::round((lo + 0.5 * side) / extent) * extent;
+      }
+      const double hi = lo + side;
       const double near = std::max({0.0, lo, -hi}), far = std::max(std::abs(lo), std::abs(hi));
       near2 += near * near;
       far2 += far * far;

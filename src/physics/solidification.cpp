@@ -45,13 +45,20 @@ void Solidification::initialize() {
 }
 
 double Solidification::explicit_limit(double dx) const {
-  // Largest eigenvalues: 4 DIM D/dx^2 of the solute's 2 DIM + 1 point Laplacian; for the phase the stiffness
-  // (a_s + a_s'')/a_s across the interface times the isotropic Laplacian's 16/3 (2D) or 8 (3D).
-  const double eps = phase_.anisotropy;
-  const double stiffness = (1 + 15 * eps) / (1 - eps);
-  const double largest = std::max(4.0 * DIM * parameters_.diffusivity, (DIM == 2 ? 16.0 / 3 : 8.0) * stiffness);
+  // Largest eigenvalue of the solute's 2 DIM + 1 point Laplacian of U = c/A over the interface: across it the
+  // faces see (1-phi)/2 half a cell away, which for small k and coarse cells outweighs A = k + (1-k)(1-phi)/2.
+  double across = 1;
+  for (double psi = -8; psi < 8; psi += 0.05) {
+    const auto liquid = [](double x) { return 1 / (1 + std::exp(SQRT2 * x)); };
+    const double a = parameters_.k + (1 - parameters_.k) * liquid(psi);
+    across = std::max(across, 0.5 * (liquid(psi - 0.5 * dx) + liquid(psi + 0.5 * dx)) / a);
+  }
+  const double solute = 4.0 * (across + DIM - 1) * parameters_.diffusivity;
+  // The phase: (a_s + a_s'')/a_s along the interface times the isotropic Laplacian's 16/3 (2D) or 8 (3D).
+  const double stiffness = (1 + 15 * phase_.anisotropy) / (1 - phase_.anisotropy);
+  const double phase = (DIM == 2 ? 16.0 / 3 : 8.0) * stiffness;
   constexpr double SAFETY = 0.9;
-  return 2 * SAFETY * dx * dx / largest;
+  return 2 * SAFETY * dx * dx / std::max(solute, phase);
 }
 
 int Solidification::stages(double dt, double dx) const {

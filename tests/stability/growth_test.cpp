@@ -32,7 +32,7 @@ TEST(HardGrowth, AlloysAndSpacings) {
       {"alloy.W0_over_d0=3.61", "alloy.supersaturation=0.8"},
       {"alloy.W0_over_d0=30", "alloy.supersaturation=0.5"},
       {"alloy.W0_over_d0=1", "alloy.supersaturation=0.95"},
-      {"alloy.partition_coefficient=0.02"},
+      {"alloy.partition_coefficient=0.01"},
       {"alloy.partition_coefficient=0.95"},
       {"phase_field.anisotropy=0.06", "alloy.W0_over_d0=1.84"},
       {"phase_field.anisotropy=0"},
