@@ -19,8 +19,9 @@ using physics::Stage;
 namespace {
 
 constexpr int GHOSTS = 2;
-constexpr int MARGIN = 8;  // doubles before and after the cells of a row: rows start on a cache line
+constexpr int MARGIN = 8;  // doubles before and after the cells of a row: rows start on a cache line, end in whole vectors
 constexpr std::size_t ALIGNMENT = 64;
+constexpr double STEEPEST = 4.0;  // as in the kernel
 
 // exp(psi/sqrt2), t = (1-phi)/2 and U of N cells.
 void primitives_row(int n, const double* __restrict psi, const double* __restrict c, double k, double* __restrict e_,
@@ -41,65 +42,57 @@ void primitives_row(int n, const double* __restrict psi, const double* __restric
 void rate_row(int n, const double* __restrict psi, const double* __restrict t_, const double* __restrict u_,
               const AlloyParameters& p, double dx, std::ptrdiff_t Y, [[maybe_unused]] std::ptrdiff_t Z,
               double* __restrict rate) {
-  const double h = 1.0 / dx, h2 = h * h, b = 1.0 - 3.0 * p.epsilon, e4 = 4.0 * p.epsilon, drive = SQRT2 * p.lambda;
+  const double b = 1.0 - 3.0 * p.epsilon, e4 = 4.0 * p.epsilon, e16 = 4.0 * e4, drive = 4.0 * SQRT2 * p.lambda;
+  const double h2 = 1.0 / (dx * dx), tiny = 1e-12 * 144.0 * dx * dx, to_p2 = h2 / 144.0;
 #pragma omp simd
   for (int i = 0; i < n; ++i) {
     const double* f = psi + i;
-    // Gradient p, second derivatives m, Laplacian: isotropic stencils of 9 or 19 points.
+    // Isotropic stencils of 9 or 19 points, in units of the grid: p = 12 h grad psi, mxx = h^2 d2/dx2,
+    // mxy = 4 h^2 d2/dxdy, laplacian = 6 h^2 lap.
     const double ee = f[1], w = f[-1], nn = f[Y], s = f[-Y];
     const double ne = f[Y + 1], nw = f[Y - 1], se = f[1 - Y], sw = f[-Y - 1];
-    const double mxx = h2 * (ee - 2.0 * f[0] + w), myy = h2 * (nn - 2.0 * f[0] + s);
-    const double mxy = 0.25 * h2 * ((ne - nw) - (se - sw));
+    const double dx_xy = (ne - sw) + (se - nw), dy_xy = (ne - sw) - (se - nw), sxy = (ne + sw) + (nw + se);
+    const double mxx = (ee + w) - 2.0 * f[0], myy = (nn + s) - 2.0 * f[0], mxy = (ne + sw) - (nw + se);
     double px, py, laplacian, p2, p4;
-    [[maybe_unused]] double pz = 0, mzz = 0, mxz = 0, myz = 0;
+    [[maybe_unused]] double pz = 0, mzz = 0, mxz = 0, myz = 0, qz = 0;
     if constexpr (DIM == 2) {
-      px = h / 12.0 * (4.0 * (ee - w) + ((ne - sw) + (se - nw)));
-      py = h / 12.0 * (4.0 * (nn - s) + ((ne - sw) - (se - nw)));
-      laplacian = h2 / 6.0 * (4.0 * ((ee + w) + (nn + s)) + ((ne + sw) + (nw + se)) - 20.0 * f[0]);
-      p2 = 1e-12 + (px * px + py * py);
-      p4 = px * px * (px * px) + py * py * (py * py);
+      px = 4.0 * (ee - w) + dx_xy;
+      py = 4.0 * (nn - s) + dy_xy;
+      laplacian = 4.0 * ((ee + w) + (nn + s)) + sxy - 20.0 * f[0];
     } else {
       const double u = f[Z], d = f[-Z], eu = f[Z + 1], wu = f[Z - 1], ed = f[1 - Z], wd = f[-Z - 1];
       const double nu = f[Y + Z], su = f[Z - Y], nd = f[Y - Z], sd = f[-Y - Z];
-      mzz = h2 * (u - 2.0 * f[0] + d);
-      mxz = 0.25 * h2 * ((eu - wu) - (ed - wd));
-      myz = 0.25 * h2 * ((nu - su) - (nd - sd));
-      px = h / 12.0 * (2.0 * (ee - w) + (((ne - sw) + (se - nw)) + ((eu - wd) + (ed - wu))));
-      py = h / 12.0 * (2.0 * (nn - s) + (((ne - sw) - (se - nw)) + ((nu - sd) + (nd - su))));
-      pz = h / 12.0 * (2.0 * (u - d) + (((eu - wd) - (ed - wu)) + ((nu - sd) - (nd - su))));
-      laplacian = h2 / 6.0 *
-                  (2.0 * ((ee + w) + (nn + s) + (u + d)) +
-                   (((ne + sw) + (nw + se)) + ((eu + wd) + (wu + ed)) + ((nu + sd) + (su + nd))) - 24.0 * f[0]);
-      p2 = 1e-12 + (px * px + py * py + pz * pz);
-      p4 = px * px * (px * px) + py * py * (py * py) + pz * pz * (pz * pz);
+      mzz = (u + d) - 2.0 * f[0];
+      mxz = (eu + wd) - (wu + ed);
+      myz = (nu + sd) - (su + nd);
+      px = 2.0 * (ee - w) + (dx_xy + ((eu - wd) + (ed - wu)));
+      py = 2.0 * (nn - s) + (dy_xy + ((nu - sd) + (nd - su)));
+      pz = 2.0 * (u - d) + (((eu - wd) - (ed - wu)) + ((nu - sd) - (nd - su)));
+      laplacian = 2.0 * ((ee + w) + (nn + s) + (u + d)) + (sxy + ((eu + wd) + (wu + ed)) + ((nu + sd) + (su + nd))) - 24.0 * f[0];
+      qz = pz * pz;
     }
-    const double m = b * p2 * p2 + e4 * p4;  // a_s |grad psi|^4
+    const double qx = px * px, qy = py * py;
+    p2 = tiny + ((qx + qy) + qz);
+    p4 = qx * qx + qy * qy + qz * qz;
+    const double p22 = p2 * p2;
+    const double m = b * p22 + e4 * p4;  // a_s |grad psi|^4
     const double inverse = 1.0 / (p2 * m);
-    const double ip2 = inverse * m;
-    const double ratio = inverse * p2 * p2 * p2;  // 1 / a_s
-    const double a = m * ip2 * ip2;
-    const double sum4 = p4 * ip2 * ip2;
-    const double gx = px * (px * px * ip2 - sum4), gy = py * (py * py * ip2 - sum4);
-    double mpx = mxx * px + mxy * py, mpy = mxy * px + myy * py;
-    double mgx = mxx * gx + mxy * gy, mgy = mxy * gx + myy * gy;
-    double nnm = px * px * mxx + py * py * myy;
-    double nmn = px * mpx + py * mpy, wmn = gx * mpx + gy * mpy, wmw = gx * mgx + gy * mgy;
+    const double ip2 = inverse * m, ip4 = ip2 * ip2;
+    const double ratio = inverse * p2 * p22;  // 1 / a_s
+    const double a = m * ip4, sum4 = p4 * ip4, as = a * sum4, a2 = a + a;
+    const double x = qx * ip2 - sum4, y = qy * ip2 - sum4;
+    const double ex = e16 * x, ey = e16 * y, sx = a2 * x + as, sy = a2 * y + as;
+    double diagonal = qx * ((ex * x + 3.0 * a) - (sx + sx)) * mxx + qy * ((ey * y + 3.0 * a) - (sy + sy)) * myy;
+    double off = (px * py) * (ex * y - (sx + sy)) * mxy;
     if constexpr (DIM == 3) {
-      const double gz = pz * (pz * pz * ip2 - sum4);
-      mpx += mxz * pz;
-      mpy += myz * pz;
-      mgx += mxz * gz;
-      mgy += myz * gz;
-      const double mpz = mxz * px + myz * py + mzz * pz, mgz = mxz * gx + myz * gy + mzz * gz;
-      nnm += pz * pz * mzz;
-      nmn = px * mpx + py * mpy + pz * mpz;
-      wmn = gx * mpx + gy * mpy + gz * mpz;
-      wmw = gx * mgx + gy * mgy + gz * mgz;
+      const double z = qz * ip2 - sum4, ez = e16 * z, sz = a2 * z + as;
+      diagonal += qz * ((ez * z + 3.0 * a) - (sz + sz)) * mzz;
+      off += (px * pz) * (ex * z - (sx + sz)) * mxz + (py * pz) * (ey * z - (sy + sz)) * myz;
     }
-    const double div = a * a * laplacian + 16.0 * e4 * e4 * (wmw * ip2) +
-                       4.0 * e4 * a * (3.0 * (nnm * ip2) - sum4 * (laplacian + 2.0 * (nmn * ip2)) - 4.0 * (wmn * ip2));
+    const double aa = a * a;
+    const double div = h2 * ((1.0 / 6.0) * (aa - e16 * as) * laplacian + (e16 * ip2) * (diagonal + 0.5 * off));
     const double t = t_[i], phi = 1.0 - 2.0 * t;
-    const double r = ratio * ratio * (div + SQRT2 * phi * (1.0 - a * a * p2) - drive * 4.0 * t * (1.0 - t) * u_[i]);
+    const double r = ratio * ratio * (div + SQRT2 * phi * (1.0 - std::min(aa * (to_p2 * p2), STEEPEST)) - drive * (t - t * t) * u_[i]);
     const bool held = (f[0] >= PSI_MAX && r > 0) || (f[0] <= -PSI_MAX && r < 0);
     rate[i] = held ? 0.0 : r;
   }
@@ -164,6 +157,7 @@ void update_row(int n, const Stage& stage, double dx, const double* __restrict p
 void PlainAlloy::Free::operator()(double* p) const { std::free(p); }
 
 PlainAlloy::Array PlainAlloy::allocate(std::ptrdiff_t doubles) {
+  doubles += MARGIN;  // the last vector of the last row looks one cell beyond
   void* memory = std::aligned_alloc(ALIGNMENT, static_cast<std::size_t>(doubles) * sizeof(double));
   if (memory == nullptr) throw std::bad_alloc();
   auto* p = static_cast<double*>(memory);
@@ -216,8 +210,9 @@ void PlainAlloy::fill_ghosts() {
 
 void PlainAlloy::advance(const AlloyParameters& p, const Stage& stage) {
   const FluxConstants constants(p, dx_);
-  const int around = DIM == 2 ? 0 : 1;               // rows j of a slab, and one on either side in 3D
+  const int around = DIM == 2 ? 0 : 1;  // rows j of a slab, and one on either side in 3D
   const int rows = DIM == 2 ? 1 : n_;
+  const int whole = (n_ + 2 + 7) / 8 * 8;  // cells of a row and its nearest ghosts, in whole vectors
   for (int k = -1; k <= n_; ++k) {
     const int now = k & 1, before = 1 - now;
     for (int j = -around; j < rows + around; ++j) {
@@ -226,8 +221,8 @@ void PlainAlloy::advance(const AlloyParameters& p, const Stage& stage) {
       const std::ptrdiff_t cell = row + (k + GHOSTS) * slab_;
       double *e = e_[now].get() + row, *u = u_[now].get() + row, *rate = rate_[now].get() + row;
       double* t = t_.get() + MARGIN;
-      primitives_row(n_ + 2, psi_.get() + cell - 1, c_.get() + cell - 1, p.k, e - 1, t - 1, u - 1);
-      rate_row(n_ + 2, psi_.get() + cell - 1, t - 1, u - 1, p, dx_, row_, slab_, rate - 1);
+      primitives_row(whole, psi_.get() + cell - 1, c_.get() + cell - 1, p.k, e - 1, t - 1, u - 1);
+      rate_row(whole, psi_.get() + cell - 1, t - 1, u - 1, p, dx_, row_, slab_, rate - 1);
       if (k < 0 || j >= rows) continue;
       // 2. Row j of slab k-1: fluxes through its high sides.
       const std::ptrdiff_t at = cell - slab_;
@@ -242,7 +237,7 @@ void PlainAlloy::advance(const AlloyParameters& p, const Stage& stage) {
         flux_row(n_, psi, row_, 1, slab_, e0, e0 + row_, u0, u0 + row_, rate0, rate0 + row_, constants, y_hi);
       if (j < 0) continue;
       double* x = flux_x_.get() + MARGIN;
-      flux_row(n_ + 1, psi - 1, 1, row_, slab_, e0 - 1, e0, u0 - 1, u0, rate0 - 1, rate0, constants, x - 1);
+      flux_row(whole, psi - 1, 1, row_, slab_, e0 - 1, e0, u0 - 1, u0, rate0 - 1, rate0, constants, x - 1);
       // 3. The next stage.
       update_row(n_, stage, dx_, psi, c_.get() + at, rate0, x, y_lo, y_hi, across_lo, across_hi,
                  psi_next_.get() + at, c_next_.get() + at);

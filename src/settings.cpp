@@ -35,7 +35,8 @@ void MeshOptions::declare(io::Schema& schema) {
   const std::vector<std::pair<std::string, Side>> cases{
       {"wall", Side::wall}, {"symmetry", Side::symmetry}, {"open", Side::open}, {"periodic", Side::periodic}};
   const char* names[] = {"xlo", "xhi", "ylo", "yhi", "zlo", "zhi"};
-  for (std::size_t f = 0; f < FACES; ++f) t.choice(names[f], sides[f], cases).doc("side of the box");
+  for (std::size_t f = 0; f < 6; ++f)
+    t.choice(names[f], sides[f], cases).doc(f < 4 ? "side of the box" : "side of the box; 3D only");
   t.integer("max_regrid_steps", max_regrid_steps).range(1, 1000).doc("steps between changes of the mesh at most");
   schema.check({"mesh"}, [this](io::Checks& c) {
     if (dim != DIM) return;  // the launcher picks the program; nothing else can be right in the wrong one
@@ -145,7 +146,7 @@ void Settings::derive() {
 amr::MeshShape choose_shape(const RealVec& size, const MeshOptions& o) {
   amr::MeshShape shape;
   shape.block_cells = o.block_cells;
-  shape.sides = o.sides;
+  std::copy_n(o.sides.begin(), FACES, shape.sides.begin());
   const double n = o.block_cells;
   const auto near_integer = [](double x) { return std::abs(x - std::round(x)) < 1e-6 * std::max(1.0, x); };
   if (o.root_blocks) {

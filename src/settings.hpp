@@ -33,7 +33,7 @@ struct MeshOptions {
   int block_cells = 16;
   std::optional<IntVec> root_blocks;
   std::optional<int> levels;
-  std::array<amr::Side, FACES> sides{};
+  std::array<amr::Side, 6> sides{};  ///< those of z are read in 3D only
   int max_regrid_steps = 50;
 
   void declare(io::Schema& schema);

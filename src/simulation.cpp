@@ -27,6 +27,16 @@ constexpr double DIAGNOSTICS_TOLERANCE = 1e-9;  // of a time, relative: reached
 
 std::size_t at(int i) { return static_cast<std::size_t>(i); }
 
+// What a restart cannot change: the state would lose its meaning.
+std::vector<double> shape_numbers(const Settings& s, std::size_t crystals) {
+  std::vector<double> n{static_cast<double>(s.shape.block_cells), static_cast<double>(s.shape.max_level),
+                        s.shape.root_dx,  s.scales.k, s.scales.lambda, s.scales.w0_um, s.scales.tau0_s,
+                        s.scales.supersaturation, static_cast<double>(crystals)};
+  for (int a = 0; a < DIM; ++a) n.push_back(s.shape.root_blocks[a]);
+  for (const amr::Side side : s.shape.sides) n.push_back(static_cast<double>(side));
+  return n;
+}
+
 // The first multiple of an interval that lies after t.
 std::int64_t next_multiple(double t, double interval) {
   if (interval <= 0) return 1;
@@ -87,6 +97,8 @@ void Simulation::build_initial_mesh() {
 
 void Simulation::resume(const std::string& file) {
   const io::RunState s = io::read_state(file, comm_);
+  if (s.numbers.at("shape") != shape_numbers(settings_, crystals_.size()))
+    throw io::OutputError(file, "restart", "the input describes another box, mesh, alloy or set of seeds than the checkpoint");
   amr::Tree tree(settings_.shape.root_blocks, settings_.shape.periodic(), settings_.shape.max_level,
                  io::read_leaves(file, comm_));
   const std::vector<double> weights(at(tree.size()), 1.0);
@@ -99,9 +111,10 @@ void Simulation::resume(const std::string& file) {
   step_ = s.step;
   auto take = [&](const char* name) { return s.numbers.at(name).at(0); };
   next_regrid_ = static_cast<std::int64_t>(take("next_regrid"));
-  plots_ = static_cast<std::int64_t>(take("plots"));
-  lines_ = static_cast<std::int64_t>(take("lines"));
-  checkpoints_ = static_cast<std::int64_t>(take("checkpoints"));
+  // Counted anew, because a restart may have other intervals.
+  plots_ = next_multiple(time_, settings_.plot_interval);
+  lines_ = next_multiple(time_, settings_.diagnostics_interval);
+  checkpoints_ = next_multiple(time_, settings_.output.checkpoint_every_s / settings_.scales.tau0_s) - 1;
   last_line_step_ = static_cast<std::int64_t>(take("last_line_step"));
   initial_solute_ = take("initial_solute");
   const std::vector<double>& positions = s.numbers.at("crystal_positions");
@@ -122,9 +135,7 @@ io::RunState Simulation::state() const {
   s.step = step_;
   s.input = settings_.schema.resolved_toml();
   s.numbers["next_regrid"] = {static_cast<double>(next_regrid_)};
-  s.numbers["plots"] = {static_cast<double>(plots_)};
-  s.numbers["lines"] = {static_cast<double>(lines_)};
-  s.numbers["checkpoints"] = {static_cast<double>(checkpoints_)};
+  s.numbers["shape"] = shape_numbers(settings_, crystals_.size());
   s.numbers["last_line_step"] = {static_cast<double>(last_line_step_)};
   s.numbers["initial_solute"] = {initial_solute_};
   for (const physics::Seed& g : crystals_)
@@ -189,7 +200,7 @@ Outcome Simulation::run() {
   try {
     return run_to_end();
   } catch (const NumericalError& e) {
-    save("failed");
+    write_checkpoint(path(fmt::format("failed_{:07d}.h5", step_)));  // beside the good ones, not among them
     write_manifest(std::string("failed: ") + e.what());
     throw;
   }
@@ -209,8 +220,10 @@ Outcome Simulation::run_to_end() {
         const Totals t = totals();
         check_finite(t);
         if (step_ != last_line_step_) {
-          write_line(t, dt);
-          write_tips();
+          io::SharedFailure failure;  // one rank writes; all must learn that it could not
+          failure.attempt(path("diagnostics.csv"), "write a line", [&] { write_line(t, dt); });
+          write_tips(failure);
+          failure.agree(comm_);
           last_line_step_ = step_;
         }
         lines_ = next_multiple(time_, settings_.diagnostics_interval);
@@ -226,11 +239,11 @@ Outcome Simulation::run_to_end() {
                            step_ % settings_.output.checkpoint_every_steps == 0;
     if (due(checkpoints_ + 1, checkpoint_interval) || steps_due) {
       checkpoints_ = next_multiple(time_, checkpoint_interval) - 1;
-      clock_.time("checkpoint", [&] { save("chk"); });
+      clock_.time("checkpoint", [&] { save(); });
     }
     const double limit = settings_.run.wall_clock_limit_s;
     if (amr::global_any(stop_requested != 0 || (limit > 0 && MPI_Wtime() - wall_start_ > limit), comm_)) {
-      clock_.time("checkpoint", [&] { save("chk"); });
+      clock_.time("checkpoint", [&] { save(); });
       write_manifest("stopped");
       return Outcome::stopped;
     }
@@ -342,7 +355,9 @@ void Simulation::open_output() {
         for (const auto& e : std::filesystem::directory_iterator(settings_.output.dir)) {
           const std::string name = e.path().filename().string();
           // What an earlier run left here would be mistaken for this one's.
-          if (name.starts_with("plt") || name.starts_with("chk_")) std::filesystem::remove(e.path());
+          if (name == "plt.hdf.series" || (name.starts_with("plt_") && name.ends_with(".hdf")) ||
+              (name.starts_with("chk_") && name.ends_with(".h5")))
+            std::filesystem::remove(e.path());
         }
         diagnostics_csv_ = std::make_unique<io::CsvFile>(path("diagnostics.csv"), diagnostics);
         tips_csv_ = std::make_unique<io::CsvFile>(path("tips.csv"), tips);
@@ -363,7 +378,7 @@ void Simulation::write_line(const Totals& t, double dt) {
                           s.speed_um_s(std::sqrt(speed)), 0, 0, MPI_Wtime() - wall_start_});
 }
 
-void Simulation::write_tips() {
+void Simulation::write_tips(io::SharedFailure& failure) {
   const physics::Scales& s = settings_.scales;
   for (const physics::Tip& t : tips()) {
     const std::string name = fmt::format("{}.{}", t.grain, t.arm);
@@ -380,7 +395,7 @@ void Simulation::write_tips() {
     line.push_back(s.speed_um_s(speed));
     line.push_back(t.radius * s.w0_um);
     line.push_back(t.off_axis_deg);
-    tips_csv_->line(line);
+    failure.attempt(path("tips.csv"), "write a line", [&] { tips_csv_->line(line); });
   }
 }
 
@@ -425,8 +440,8 @@ void Simulation::write_plotfile() {
 
 void Simulation::write_checkpoint(const std::string& file) { io::write_checkpoint(file, *mesh_, state()); }
 
-void Simulation::save(const char* prefix) {
-  const std::string file = path(fmt::format("{}_{:07d}.h5", prefix, step_));
+void Simulation::save() {
+  const std::string file = path(fmt::format("chk_{:07d}.h5", step_));
   write_checkpoint(file);
   saved_.erase(std::remove(saved_.begin(), saved_.end(), file), saved_.end());
   saved_.push_back(file);

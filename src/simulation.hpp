@@ -12,6 +12,7 @@
 #include "amr/regrid.hpp"
 #include "io/checkpoint.hpp"
 #include "io/diagnostics.hpp"
+#include "io/hdf5.hpp"
 #include "physics/crystals.hpp"
 #include "physics/module.hpp"
 #include "settings.hpp"
@@ -93,9 +94,9 @@ class Simulation {
   Outcome run_to_end();
   void open_output();
   void write_line(const Totals& t, double dt);
-  void write_tips();
+  void write_tips(io::SharedFailure& failure);
   void write_plotfile();
-  void save(const char* prefix);
+  void save();
   void write_manifest(const std::string& status);
   void progress(const Totals& t, double dt, bool last);
   std::string path(const std::string& name) const { return settings_.output.dir + "/" + name; }

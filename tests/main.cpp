@@ -42,7 +42,8 @@ int main(int argc, char** argv) {
   if (rank > 0) {
     ::testing::TestEventListeners& listeners = ::testing::UnitTest::GetInstance()->listeners();
     delete listeners.Release(listeners.default_result_printer());
-    delete listeners.Release(listeners.default_xml_generator());  // one report is enough; null if none was asked for
+    delete listeners.Release(
+        listeners.default_xml_generator());  // one report is enough; null if none was asked for
     listeners.Append(new FailuresOfRank(rank));
   }
   // An exception on one rank would leave the others waiting in a collective call: let it end the whole job.

@@ -7,7 +7,7 @@
 namespace dendrift::amr {
 
 namespace {
-constexpr int LOWEST_EXPONENT = -1088;  // weight of limb 0
+constexpr int LOWEST_EXPONENT = -1152;  // weight of limb 0
 }
 
 void ExactSum::add(double x) {

@@ -15,11 +15,11 @@ namespace dendrift::amr {
 /// the summands, hence the number of ranks and threads, cannot matter. Holds up to 2^30 summands.
 class ExactSum {
  public:
-  static constexpr int LIMBS = 68;  ///< 32 bits each; the lowest has weight 2^-1088
+  static constexpr int LIMBS = 72;  ///< 32 bits each; the lowest has weight 2^-1152
 
   void add(double x);  ///< x must be finite
   void add(const ExactSum& other);
-  double value() const;  ///< the sum, rounded once
+  double value() const;  ///< the sum, rounded at the end only
   std::span<std::int64_t> limbs() { return limbs_; }
 
  private:

@@ -19,7 +19,6 @@ void FluxRegister::rebuild() {
   const Tree& tree = mesh_.tree();
   const std::ptrdiff_t per_face = face_cells(mesh_.layout().n);
   offset_.assign(static_cast<std::size_t>(mesh_.size()) * FACES, -1);
-  touches_.assign(static_cast<std::size_t>(mesh_.size()), 0);
   coarse_blocks_.clear();
   messages_.clear();
   std::ptrdiff_t used = 0;
@@ -32,7 +31,6 @@ void FluxRegister::rebuild() {
       if (kind != Neighbour::Kind::coarser && kind != Neighbour::Kind::finer) continue;
       offset_[static_cast<std::size_t>(b * FACES + f)] = used;
       used += per_face;
-      touches_[static_cast<std::size_t>(b)] = 1;
     }
   }
   values_.assign(static_cast<std::size_t>(used), 0.0);

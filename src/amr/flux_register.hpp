@@ -26,8 +26,6 @@ class FluxRegister {
     const std::ptrdiff_t o = offset_[static_cast<std::size_t>(b * FACES + face)];
     return o < 0 ? nullptr : values_.data() + o;
   }
-  /// True if block b has a face that meets coarser or finer blocks.
-  bool touches_other_level(int b) const { return touches_[static_cast<std::size_t>(b)] != 0; }
 
   /// Applies weight * div(mean of the fine fluxes - own flux) to `field` where blocks meet finer ones. Collective.
   void correct(CellField field, double weight);
@@ -74,7 +72,6 @@ class FluxRegister {
   Mesh& mesh_;
   std::int64_t generation_ = -1;
   std::vector<std::ptrdiff_t> offset_;
-  std::vector<char> touches_;
   std::vector<double> values_;
   std::vector<CoarseBlock> coarse_blocks_;
   std::vector<Message> messages_;

@@ -123,7 +123,6 @@ void GhostExchange::rebuild() {
       const int d = direction_index(face_offset(f));
       if (tree.neighbour(leaf, d).kind == Neighbour::Kind::boundary) plan.outside |= 1U << f;
     }
-    plan.restrict_self = plan.coarser != 0;
     sources.clear();
     copies_of(leaf, sources);
     bool remote = false;
@@ -268,7 +267,7 @@ void GhostExchange::fill_coarse_and_prolong(const Plan& plan, CellField field, i
 }
 
 void GhostExchange::fill_block(int b) {
-  const double begin = MPI_Wtime();
+  const double begin = omp_get_wtime();
   const Plan& plan = plans_[static_cast<std::size_t>(b)];
   thread_local std::vector<double> coarse;
   coarse.resize(static_cast<std::size_t>(coarse_size()));
@@ -282,7 +281,7 @@ void GhostExchange::fill_block(int b) {
     if (plan.coarser != 0) fill_coarse_and_prolong(plan, fields_[f], b, coarse.data());
     if (plan.outside != 0) apply_sides(plan.outside, mesh_.fields().row(fields_[f].id), block, mesh_.layout().n, G);
   }
-  clocks_[static_cast<std::size_t>(omp_get_thread_num())].seconds += MPI_Wtime() - begin;
+  clocks_[static_cast<std::size_t>(omp_get_thread_num())].seconds += omp_get_wtime() - begin;
 }
 
 void GhostExchange::fill(std::vector<CellField> fields) {

@@ -1,6 +1,7 @@
 #include "amr/tree.hpp"
 
 #include <algorithm>
+#include <cmath>
 #include <stdexcept>
 
 namespace dendrift::amr {
@@ -47,6 +48,12 @@ Tree::Tree(IntVec root_blocks, Array<bool> periodic, int max_level)
 Tree::Tree(IntVec root_blocks, Array<bool> periodic, int max_level, std::vector<BlockIndex> leaves)
     : root_blocks_(root_blocks), periodic_(periodic), max_level_(max_level), leaves_(std::move(leaves)) {
   if (max_level < 0 || max_level > 20) throw std::invalid_argument("tree: max_level must be 0 to 20");
+  for (const BlockIndex& b : leaves_) {
+    BlockIndex inside_box = b;
+    if (b.level < 0 || b.level > max_level_ || !inside(inside_box) || inside_box != b)
+      throw std::invalid_argument("tree: leaf outside the domain");
+  }
+  if (leaves_.empty()) throw std::invalid_argument("tree: no leaves");
   index_leaves();
   validate();
 }
@@ -111,7 +118,7 @@ void Tree::index_leaves() {
       const IntVec o = direction_offset(d);
       for (int a = 0; a < DIM; ++a) node.coord[a] += o[a];
       if (!inside(node)) continue;
-      const int j = locate(node);
+      const int j = std::max(0, locate(node));  // a gap before the first leaf: validate() will refuse it
       Neighbour& n = neighbours_[at(i) * DIRECTIONS + at(d)];
       const int level = leaf(j).level;
       if (level > node.level) {
@@ -128,16 +135,12 @@ void Tree::validate() const {
   // Morton ranges that neither overlap nor leave gaps inside the domain <=> volumes add up and keys differ.
   double covered = 0;
   for (int i = 0; i < size(); ++i) {
-    BlockIndex b = leaf(i);
-    if (b.level < 0 || b.level > max_level_ || !inside(b) || b != leaf(i))
-      throw std::invalid_argument("tree: leaf outside the domain");
-    covered += 1.0 / static_cast<double>(std::int64_t{1} << (DIM * b.level));
+    covered += std::ldexp(1.0, -DIM * leaf(i).level);
     if (i > 0 && keys_[at(i)] < keys_[at(i - 1)] + (std::uint64_t{1} << (DIM * (max_level_ - leaf(i - 1).level))))
       throw std::invalid_argument("tree: leaves overlap");
   }
   if (covered != static_cast<double>(volume(root_blocks_)))
     throw std::invalid_argument("tree: leaves do not cover the domain");
-  std::vector<FinerNeighbour> finer;
   for (int i = 0; i < size(); ++i) {
     for (int d = 0; d < DIRECTIONS; ++d) {
       const Neighbour n = neighbour(i, d);

@@ -114,7 +114,8 @@ std::string find_checkpoint(const std::string& file_or_dir) {
   std::string newest;
   for (const fs::directory_entry& e : fs::directory_iterator(file_or_dir)) {
     const std::string name = e.path().filename().string();
-    if (name.starts_with("chk_") && name.ends_with(".h5")) newest = std::max(newest, name);
+    if (!name.starts_with("chk_") || !name.ends_with(".h5")) continue;
+    if (std::pair(name.size(), name) > std::pair(newest.size(), newest)) newest = name;  // by number
   }
   if (newest.empty()) throw OutputError(file_or_dir, "restart", "the folder holds no checkpoint (chk_*.h5)");
   return (fs::path(file_or_dir) / newest).string();

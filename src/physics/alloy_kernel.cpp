@@ -224,7 +224,9 @@ void add_noise(const AlloyBlock& blk, const double* psi, Scratch<N>& s) {
     std::uint64_t key = blk.noise_key;
     for (int a = 0; a < DIM; ++a) {
       q += cell[a] * S::stride(a);
-      key = mix(key ^ static_cast<std::uint64_t>(blk.first_cell[a] + cell[a]));
+      std::int64_t place = blk.first_cell[a] + cell[a];
+      if (blk.period[a] > 0) place = (place + blk.period[a]) % blk.period[a];  // both sides of a face see one number
+      key = mix(key ^ static_cast<std::uint64_t>(place));
     }
     if (std::abs(psi[q]) > 4.0) return;
     rate_[q] += blk.noise * (static_cast<double>(key >> 11) * 0x1p-52 - 1.0);  // uniform in [-1, 1)
@@ -339,7 +341,7 @@ void fill_bulk_phase(const AlloyBlock& blk, double value) {
   });
 }
 
-// Bulk liquid: phi = -1, so (2) is plain diffusion of c. The coefficient is the one that solute_flux finds
+// Bulk liquid: phi = -1, so eq. (2) is plain diffusion of c. The coefficient is the one that solute_flux finds
 // between two such cells, so that both sides of a face agree.
 template <int N>
 void liquid_fluxes(const AlloyBlock& blk, const AlloyParameters& par, Scratch<N>& s) {

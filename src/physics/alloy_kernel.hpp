@@ -90,6 +90,7 @@ struct AlloyBlock {
   double noise = 0;                ///< amplitude of the random rate of psi, 0: none
   std::uint64_t noise_key = 0;     ///< the same for all stages of a step
   Array<std::int64_t> first_cell{};  ///< index of cell 0 on its level
+  Array<std::int64_t> period{};      ///< cells after which the mesh repeats along an axis, 0: never
 };
 
 enum class BlockKind : std::uint8_t { liquid, solid, interface };

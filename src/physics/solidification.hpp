@@ -33,11 +33,14 @@ class Solidification : public Module {
   std::vector<double> memory() const override { return {fastest_}; }
   void recall(const std::vector<double>& m) override { fastest_ = m.at(0); }
 
-  /// Stages that a step of dt takes on a mesh whose finest spacing is dx, and the largest step of one stage.
-  int stages(double dt, double dx) const;
+  /// Fewest stages with which a step of dt is stable.
+  int stages(double dt) const;
+  /// Largest step of a single explicit stage on a mesh of spacing dx, from diffusion.
   double explicit_limit(double dx) const;
-  /// Largest stable step of the phase, from the speed of the front when the mesh was last looked at.
-  double sharpening_limit() const;
+  /// Largest step of s stages of the phase, from the speed of the front when the mesh was last looked at.
+  double sharpening_limit(int s) const;
+  /// Largest step of s stages from all of these and the input.
+  double largest_step(int s) const;
   const AlloyParameters& parameters() const { return parameters_; }
 
  private:

@@ -77,6 +77,7 @@ void Transport::after_regrid() {
 
 double Transport::max_dt() const { return largest_rate_ > 0 ? COURANT / largest_rate_ : 1e30; }
 
+// v.grad phi of eq. (1).
 void Transport::carry_phase(int b, const Moment& base, const Moment& from, const Moment& to, double dt) const {
   const amr::Layout& layout = mesh_->layout();
   const double scale = dt / (12.0 * mesh_->block(b).dx);
@@ -103,6 +104,7 @@ void Transport::carry_phase(int b, const Moment& base, const Moment& from, const
   });
 }
 
+// div(v c) of eq. (2).
 void Transport::carry_solute(int b, const Moment& base, const Moment& from, const Moment& to, double dt) {
   const amr::Layout& layout = mesh_->layout();
   const int n = layout.n;

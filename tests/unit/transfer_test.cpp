@@ -4,7 +4,6 @@
 #include <gtest/gtest.h>
 
 #include <cmath>
-#include <numbers>
 #include <vector>
 
 #include "support/mesh_fixture.hpp"
@@ -219,7 +218,8 @@ TEST(Transfer, RestrictionUndoesProlongation) {
 }
 
 TEST(Transfer, ProlongationIsOfThirdOrder) {
-  // Means of cos(k.x + p) over a cell are known exactly: a product of sinc functions times the value at its centre.
+  // Means of cos(k.x + p) over a cell are known exactly: a product of sinc functions times the value at its
+  // centre.
   const Array<double> k = [] {
     Array<double> r{};
     for (int a = 0; a < DIM; ++a) r[a] = 1.0 + 0.5 * a;

@@ -127,7 +127,8 @@ std::vector<int> morton(const BlockIndex& node, int max_level) {
 
 testing::AssertionResult valid(const Tree& tree) {
   const Model model(tree);
-  if (static_cast<int>(model.leaves.size()) != tree.size()) return testing::AssertionFailure() << "a leaf twice";
+  if (static_cast<int>(model.leaves.size()) != tree.size())
+    return testing::AssertionFailure() << "a leaf twice";
   if (!model.tiles()) return testing::AssertionFailure() << "gap or overlap";
   if (!model.balanced()) return testing::AssertionFailure() << "not balanced";
   for (int i = 0; i + 1 < tree.size(); ++i) {
@@ -141,6 +142,8 @@ testing::AssertionResult valid(const Tree& tree) {
 /// The least change of the mesh that grants every refinement and keeps balance, by trial until nothing moves.
 std::set<BlockIndex> adapted_by_trial(const Tree& tree, const std::vector<std::int8_t>& change) {
   const Model model(tree);
+  std::map<BlockIndex, std::vector<BlockIndex>> touching;
+  for (const BlockIndex& leaf : tree.leaves()) touching[leaf] = model.touching(leaf);
   std::map<BlockIndex, int> wanted, target;
   for (int i = 0; i < tree.size(); ++i) wanted[tree.leaf(i)] = change[static_cast<std::size_t>(i)];
   for (const auto& [leaf, ask] : wanted) {
@@ -158,11 +161,12 @@ std::set<BlockIndex> adapted_by_trial(const Tree& tree, const std::vector<std::i
   for (bool moved = true; moved;) {
     moved = false;
     for (auto& [leaf, level] : target) {
-      for (const BlockIndex& other : model.touching(leaf)) {
+      for (const BlockIndex& other : touching[leaf]) {
         if (target[other] <= level + 1) continue;
         moved = true;
         if (level < leaf.level) {  // a family stays whole
-          for (int child = 0; child < CHILDREN; ++child) target[child_of(parent_of(leaf), child)] = leaf.level;
+          for (int child = 0; child < CHILDREN; ++child)
+            target[child_of(parent_of(leaf), child)] = leaf.level;
         } else {
           level = leaf.level + 1;
         }
@@ -237,7 +241,8 @@ TEST(Tree, MortonOrderOfKnownForest) {
 
   const Tree finer = refined(tree, {{0, test::vec(1, 0, 0)}});
   std::vector<BlockIndex> with_children{{0, test::vec(0, 0, 0)}};
-  for (int child = 0; child < CHILDREN; ++child) with_children.push_back(child_of({0, test::vec(1, 0, 0)}, child));
+  for (int child = 0; child < CHILDREN; ++child)
+    with_children.push_back(child_of({0, test::vec(1, 0, 0)}, child));
   with_children.insert(with_children.end(), expected.begin() + 2, expected.end());
   EXPECT_EQ(leaves_of(finer), with_children);
   EXPECT_EQ(finer.finest_level(), 1);
@@ -251,7 +256,8 @@ TEST(Tree, LocatesEveryNode) {
     test::Tally tally;
     for (int i = 0; i < tree.size(); ++i) {
       const BlockIndex leaf = tree.leaf(i);
-      tally.expect(tree.find(leaf) == i && tree.locate(leaf) == i, [&] { return "itself, " + test::text(leaf); });
+      tally.expect(tree.find(leaf) == i && tree.locate(leaf) == i,
+                   [&] { return "itself, " + test::text(leaf); });
       if (leaf.level < tree.max_level()) {
         for (int child = 0; child < CHILDREN; ++child) {
           tally.expect(tree.find(child_of(leaf, child)) == -1 && tree.locate(child_of(leaf, child)) == i,
@@ -291,7 +297,9 @@ TEST(Tree, NeighboursInAllDirections) {
     for (int i = 0; i < tree.size(); ++i) {
       const BlockIndex leaf = tree.leaf(i);
       for (int dir = 0; dir < DIRECTIONS; ++dir) {
-        const auto where = [&] { return test::text(leaf) + " direction " + test::text(direction_offset(dir)); };
+        const auto where = [&] {
+          return test::text(leaf) + " direction " + test::text(direction_offset(dir));
+        };
         const Neighbour n = tree.neighbour(i, dir);
         std::vector<FinerNeighbour> finer{{-7, {}}};  // must still be there afterwards
         if (n.kind == Neighbour::Kind::finer) tree.finer_neighbours(i, dir, finer);
@@ -304,7 +312,9 @@ TEST(Tree, NeighboursInAllDirections) {
         if (!next) {
           tally.expect(n.kind == Neighbour::Kind::boundary && n.leaf == -1, where);
         } else if (const std::optional<BlockIndex> cover = model.cover(*next)) {
-          tally.expect(n.kind == (cover->level == leaf.level ? Neighbour::Kind::same : Neighbour::Kind::coarser), where);
+          tally.expect(
+              n.kind == (cover->level == leaf.level ? Neighbour::Kind::same : Neighbour::Kind::coarser),
+              where);
           tally.expect(n.leaf >= 0 && tree.leaf(n.leaf) == *cover, where);
         } else {
           tally.expect(n.kind == Neighbour::Kind::finer && n.leaf == -1, where);
@@ -360,7 +370,8 @@ TEST(Tree, OnePeriodicRootIsItsOwnNeighbour) {
   }
   // Refined once, every child meets every other one, across the domain too.
   const Tree finer = refined(tree, {{0, {}}});
-  for (int i = 0; i < CHILDREN; ++i) EXPECT_EQ(finer.touching(i).size(), static_cast<std::size_t>(CHILDREN - 1));
+  for (int i = 0; i < CHILDREN; ++i)
+    EXPECT_EQ(finer.touching(i).size(), static_cast<std::size_t>(CHILDREN - 1));
 }
 
 TEST(Tree, RandomAdaptationGivesTheLeastBalancedTree) {
@@ -394,14 +405,16 @@ TEST(Tree, RandomAdaptationGivesTheLeastBalancedTree) {
           for (int child = 0; child < CHILDREN; ++child) {
             const int sibling = tree.find(child_of(parent_of(leaf), child));
             ASSERT_GE(sibling, 0);
-            ASSERT_LT(change[static_cast<std::size_t>(sibling)], 0) << "coarsened against the will of a sibling";
+            ASSERT_LT(change[static_cast<std::size_t>(sibling)], 0)
+                << "coarsened against the will of a sibling";
           }
         }
         if (ask <= 0 && covers.level > leaf.level) ++spread;
         if (ask < 0 && covers.level == leaf.level) ++refused;
       }
       const std::set<BlockIndex> expected = adapted_by_trial(tree, change);
-      ASSERT_EQ(std::set<BlockIndex>(next.leaves().begin(), next.leaves().end()), expected) << "round " << round;
+      ASSERT_EQ(std::set<BlockIndex>(next.leaves().begin(), next.leaves().end()), expected)
+          << "round " << round;
       tree = next;
       ++rounds;
     }
@@ -501,7 +514,8 @@ TEST(Tree, FromLeavesRejectsOverlaps) {
       std::vector<BlockIndex> twice = leaves;
       twice.push_back(at(i));
       EXPECT_THROW(with_leaves(tree, twice), std::invalid_argument);
-      // The right number of leaves and even the right volume: one leaf takes the place of another of its level.
+      // The right number of leaves and even the right volume: one leaf takes the place of another of its
+      // level.
       for (int j = 0; j < tree.size(); ++j) {
         if (j == i || at(j).level != at(i).level) continue;
         std::vector<BlockIndex> shadowed = leaves;
@@ -560,7 +574,8 @@ TEST(Tree, FromLeavesRejectsImpossibleLevels) {
     std::vector<BlockIndex> too_fine;  // a fine tiling, but finer than max_level
     for (const BlockIndex& root : shallow.leaves())
       for (int child = 0; child < CHILDREN; ++child)
-        for (int below = 0; below < CHILDREN; ++below) too_fine.push_back(child_of(child_of(root, child), below));
+        for (int below = 0; below < CHILDREN; ++below)
+          too_fine.push_back(child_of(child_of(root, child), below));
     EXPECT_THROW(with_leaves(shallow, too_fine), std::invalid_argument);
     for (const int level : {-1, -20, 1000}) {
       std::vector<BlockIndex> strange = leaves_of(shallow);
@@ -571,8 +586,8 @@ TEST(Tree, FromLeavesRejectsImpossibleLevels) {
 }
 
 TEST(Tree, FromLeavesRejectsImbalance) {
-  // Each direction in turn: the node there is a leaf of level 0, the block in the middle has leaves of level 2 in
-  // the corner that faces it, so balance fails through that face, edge or corner alone.
+  // Each direction in turn: the node there is a leaf of level 0, the block in the middle has leaves of level
+  // 2 in the corner that faces it, so balance fails through that face, edge or corner alone.
   for (int dir = 0; dir < DIRECTIONS; ++dir) {
     if (dir == CENTRE) continue;
     const Tree tree = refined(Tree(filled(3), {}, 2), {{0, filled(1)}});
@@ -584,7 +599,8 @@ TEST(Tree, FromLeavesRejectsImbalance) {
         child |= 1 << a;
       }
     }
-    // What the corner's children touch, other than the direction under test, is refined: only `dir` is at fault.
+    // What the corner's children touch, other than the direction under test, is refined: only `dir` is at
+    // fault.
     std::vector<BlockIndex> leaves;
     IntVec fault = filled(1);
     for (int a = 0; a < DIM; ++a) fault[a] += direction_offset(dir)[a];
@@ -605,7 +621,8 @@ TEST(Tree, FromLeavesRejectsImbalance) {
 }
 
 TEST(Tree, BalanceHoldsAcrossPeriodicSides) {
-  // Fine at the low side of x, coarse at the high side: fine where there are walls, wrong where x is periodic.
+  // Fine at the low side of x, coarse at the high side: fine where there are walls, wrong where x is
+  // periodic.
   const IntVec roots = test::vec(4, 1, 1);
   const Tree walls = refined(refined(Tree(roots, {}, 2), {{0, IntVec{}}}), {{1, IntVec{}}});
   EXPECT_EQ(walls.find({0, test::vec(3, 0, 0)}), walls.size() - 1);
