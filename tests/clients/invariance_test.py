@@ -26,7 +26,7 @@ supersaturation = {omega}
 """
 SCENES = {
     # two turned crystals, noise, and all kinds of sides
-    "2D growth": (dict(lines=2, steps=49, omega=0.3), """
+    "2D growth": (dict(lines=1, steps=81, omega=0.3), """
 [mesh]
 dim = 2
 size_W0 = [256, 128]
@@ -68,7 +68,7 @@ radius_W0 = 6
 [flow]
 velocity_W0_tau0 = [4, 2]
 """),
-    "3D growth": (dict(lines=0.5, steps=33, omega=0.35), """
+    "3D growth": (dict(lines=0.2, steps=41, omega=0.3), """
 [mesh]
 dim = 3
 size_W0 = [64, 64, 64]
@@ -85,8 +85,8 @@ zhi = "periodic"
 [phase_field]
 noise = 0.05
 [[seed]]
-position_W0 = [15, 11, 20]
-radius_W0 = 5
+position_W0 = [18.3, 3.1, 21.7]
+radius_W0 = 6
 euler_deg = [10, 30, 50]
 """),
     "3D drift": (dict(lines=0.2, steps=33, omega=0.2), """

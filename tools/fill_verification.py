@@ -1,0 +1,97 @@
+#!/usr/bin/python3
+"""Writes the tables of docs/results into docs/verification.md: between the header of a table that follows a line
+`tools/verify.py CASE` and the next blank line, rows are replaced by those of the CSV file."""
+import csv
+import os
+import re
+
+ROOT = os.path.dirname(os.path.dirname(os.path.abspath(__file__)))
+
+
+def rows(name):
+    with open(os.path.join(ROOT, "docs", "results", name + ".csv")) as f:
+        return list(csv.DictReader(f))
+
+
+def num(text, digits):
+    return f"{float(text):.{digits}f}"
+
+
+def growth(r):
+    return [r["mesh"], r["dx_W0"], num(r["tip_100"], 3), num(r["tip_100_err_percent"], 2) + " %", num(r["tip_200"], 3),
+            num(r["tip_200_err_percent"], 2) + " %", num(r["V_200"], 5), num(r["V_200_err_percent"], 2) + " %"]
+
+
+def growth_dt(r):
+    return [r["max_dt_tau0"], num(r["tip_200"], 4), num(r["tip_200_change_percent"], 4) + " %"]
+
+
+def growth_3d(r):
+    return [r["dx_W0"], num(r["tip_25"], 3), num(r["tip_25_err_percent"], 2) + " %",
+            num(r["volume_25_err_percent"], 2) + " %", num(r["tip_50"], 3), num(r["tip_50_err_percent"], 2) + " %",
+            num(r["volume_50_err_percent"], 2) + " %"]
+
+
+def rotation(r):
+    return [r["dx_W0"], r["angle_deg"], num(r["tip_200"], 3), num(r["error_percent"], 2) + " %",
+            num(r["against_0_percent"], 2) + " %", num(r["off_axis_deg"], 4)]
+
+
+def drift(r):
+    return [r["dx_W0"], r["antitrapping"], r["drift"], *(num(r[k + "_percent"], 3) + " %" for k in
+            ("leading", "trailing", "lateral", "leading_speed", "trailing_speed")),
+            num(r["lateral_lean_deg"], 2) + " deg", num(r["lateral_apex_percent"], 2) + " %"]
+
+
+def carried(r):
+    return [r["dx_W0"], num(r["radius_min"], 3) + " to " + num(r["radius_max"], 3),
+            num(r["area_change_percent"], 2) + " %", num(r["U_rms_error"], 4), num(r["U_min"], 4) + ", " + num(r["U_max"], 4)]
+
+
+def width_rows():
+    table = rows("width")
+    base = next(float(r["tip_um"]) for r in table if r["W0_over_d0"] == "10" and r["dx_W0"] == "0.8")
+    return [[r["W0_over_d0"], r["dx_W0"], num(r["tip_um"], 4), f"{100 * (float(r['tip_um']) / base - 1):.2f} %",
+             r["steps"], r["cells_at_end"], r["wall_s"]] for r in table]
+
+
+def karma_rows():
+    runs = {}
+    for r in rows("karma_2001"):
+        runs.setdefault((r["W0_over_d0"], r["dx_W0"]), []).append(r)
+    return [[*key, *(num(r["V_d0_over_D"], 4)[1:] for r in run), num(run[-1]["c_s_over_c_l"], 3)[1:]]
+            for key, run in runs.items()]
+
+
+TABLES = {
+    "growth": lambda: map(growth, rows("growth_2d")), "growth_dt": lambda: map(growth_dt, rows("growth_2d_time_step")),
+    "growth_3d": lambda: map(growth_3d, rows("growth_3d")), "rotation": lambda: map(rotation, rows("rotation")),
+    "drift": lambda: map(drift, rows("drift")), "carried": lambda: map(carried, rows("carried")),
+    "width": width_rows, "karma": karma_rows,
+}
+
+
+def main():
+    path = os.path.join(ROOT, "docs", "verification.md")
+    lines, out, case, in_table = open(path).read().split("\n"), [], None, False
+    for line in lines:
+        found = re.match(r"`tools/verify.py (\w+)`", line)
+        if found:
+            case = found.group(1)
+        if in_table and not line.startswith("| print"):
+            if line.startswith("|") or line.startswith("@"):
+                continue
+            in_table = False
+        out.append(line)
+        if line.startswith("| ---") and case in TABLES:
+            in_table = True
+            table = ["| " + " | ".join(r) + " |" for r in TABLES[case]()]
+            if case != "karma":
+                out += table
+        if in_table and line.startswith("| print"):
+            out += table
+    open(path, "w").write("\n".join(out))
+
+
+if __name__ == "__main__":
+    main()
