@@ -18,7 +18,7 @@ import h5py
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent / "lib"))
-from support import (SOURCE, Failure, Result, check_result, column, command_line, environment, fail, read_csv, require,
+from support import (Failure, Result, check_result, column, command_line, environment, fail, read_csv, require,
                      run, say, scratch, snapshot)
 
 # Columns that must stand at the beginning, in this order; more may follow.

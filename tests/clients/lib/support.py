@@ -65,7 +65,7 @@ def environment(threads=1):
     return {**os.environ, **ENVIRONMENT, "OMP_NUM_THREADS": str(threads)}
 
 
-def run(*words, ranks=0, threads=1, code=0, cwd=None, timeout=120, user=None):
+def run(*words, ranks=0, threads=1, code=0, cwd=None, timeout=300, user=None):
     """Runs the launcher; the exit code must be `code`, or one of them, and nothing may look like a crash."""
     command = command_line(*words, ranks=ranks)
     try:
