@@ -97,7 +97,12 @@ void Simulation::build_initial_mesh() {
 
 void Simulation::resume(const std::string& file) {
   const io::RunState s = io::read_state(file, comm_);
-  if (s.numbers.at("shape") != shape_numbers(settings_, crystals_.size()))
+  const auto list = [&](const char* name) -> const std::vector<double>& {
+    const auto found = s.numbers.find(name);
+    if (found == s.numbers.end()) throw io::OutputError(file, "restart", std::string("it does not hold ") + name);
+    return found->second;
+  };
+  if (list("shape") != shape_numbers(settings_, crystals_.size()))
     throw io::OutputError(file, "restart", "the input describes another box, mesh, alloy or set of seeds than the checkpoint");
   amr::Tree tree(settings_.shape.root_blocks, settings_.shape.periodic(), settings_.shape.max_level,
                  io::read_leaves(file, comm_));
@@ -109,7 +114,7 @@ void Simulation::resume(const std::string& file) {
   io::read_fields(file, *mesh_);
   time_ = s.time;
   step_ = s.step;
-  auto take = [&](const char* name) { return s.numbers.at(name).at(0); };
+  const auto take = [&](const char* name) { return list(name).at(0); };
   next_regrid_ = static_cast<std::int64_t>(take("next_regrid"));
   // Counted anew, because a restart may have other intervals.
   plots_ = next_multiple(time_, settings_.plot_interval);
@@ -117,7 +122,7 @@ void Simulation::resume(const std::string& file) {
   checkpoints_ = next_multiple(time_, settings_.output.checkpoint_every_s / settings_.scales.tau0_s) - 1;
   last_line_step_ = static_cast<std::int64_t>(take("last_line_step"));
   initial_solute_ = take("initial_solute");
-  const std::vector<double>& positions = s.numbers.at("crystal_positions");
+  const std::vector<double>& positions = list("crystal_positions");
   for (std::size_t g = 0; g < crystals_.size(); ++g)
     for (int a = 0; a < DIM; ++a) crystals_[g].position[a] = positions.at(g * DIM + at(a));
   for (const auto& [name, values] : s.numbers)

@@ -3,6 +3,8 @@
 #include <mpi.h>
 
 #include <cstdio>
+#include <cstdlib>
+#include <filesystem>
 #include <string>
 
 namespace {
@@ -35,6 +37,12 @@ class FailuresOfRank : public ::testing::EmptyTestEventListener {
 int main(int argc, char** argv) {
   ::testing::InitGoogleTest(&argc, argv);
   if (GTEST_FLAG_GET(list_tests)) return RUN_ALL_TESTS();  // CTest asks for the names; no MPI needed
+  // Tests run side by side, each in a process of its own: without a folder of its own for Open MPI's session files, one
+  // that ends would remove those of one that starts.
+  std::string session = (std::filesystem::temp_directory_path() / "dendrift_test_XXXXXX").string();
+  const bool alone = std::getenv("OMPI_COMM_WORLD_SIZE") == nullptr && mkdtemp(session.data()) != nullptr;
+  if (alone) setenv("OMPI_MCA_orte_tmpdir_base", session.c_str(), 1);
+
   int provided = 0, rank = 0, ranks = 1;
   MPI_Init_thread(&argc, &argv, MPI_THREAD_FUNNELED, &provided);
   MPI_Comm_rank(MPI_COMM_WORLD, &rank);
@@ -54,5 +62,7 @@ int main(int argc, char** argv) {
   MPI_Allreduce(&mine, &worst, 1, MPI_INT, MPI_MAX, MPI_COMM_WORLD);
   if (rank == 0 && mine == 0 && worst != 0) std::puts("[  FAILED  ] on another rank");
   MPI_Finalize();
+  std::error_code ignored;
+  if (alone) std::filesystem::remove_all(session, ignored);
   return worst;
 }

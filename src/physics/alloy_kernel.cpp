@@ -341,7 +341,7 @@ void fill_bulk_phase(const AlloyBlock& blk, double value) {
   });
 }
 
-// Bulk liquid: phi = -1, so eq. (2) is plain diffusion of c. The coefficient is the one that solute_flux finds
+// Bulk liquid: phi = -1, so what is left is plain diffusion of c. The coefficient is the one that solute_flux finds
 // between two such cells, so that both sides of a face agree.
 template <int N>
 void liquid_fluxes(const AlloyBlock& blk, const AlloyParameters& par, Scratch<N>& s) {

@@ -3,7 +3,6 @@
 codes, stopping and restarting."""
 import json
 import math
-import os
 import re
 import resource
 import shutil
@@ -22,8 +21,8 @@ from support import (Failure, Result, check_result, column, command_line, enviro
                      run, say, scratch, snapshot)
 
 # Columns that must stand at the beginning, in this order; more may follow.
-DIAGNOSTICS = ["step", "time_s", "time_tau0", "dt_tau0", "blocks", "cells", "levels", "solid_fraction", "solute_mean_wt",
-               "solute_drift_rel", "max_speed_um_s", "div_max_rel", "flow_iterations", "wall_s"]
+DIAGNOSTICS = ["step", "time_s", "time_tau0", "dt_tau0", "blocks", "cells", "levels", "solid_fraction",
+               "solute_mean_wt", "solute_drift_rel", "max_speed_um_s", "div_max_rel", "flow_iterations", "wall_s"]
 TIPS = {2: ["time_s", "grain", "arm", "euler_deg", "x_um", "y_um", "speed_um_s", "radius_um"],
         3: ["time_s", "grain", "arm", "euler_deg", "x_um", "y_um", "z_um", "speed_um_s", "radius_um"]}
 GRAINS = {2: ["time_s", "grain", "x_um", "y_um", "vx_um_s", "vy_um_s", "omega_rad_s", "angle_rad", "area_um2",
@@ -32,8 +31,8 @@ GRAINS = {2: ["time_s", "grain", "x_um", "y_um", "vx_um_s", "vy_um_s", "omega_ra
               "omega_y_rad_s", "omega_z_rad_s", "q0", "q1", "q2", "q3", "volume_um3", "nonrigidity"]}
 FIELDS = {2: ["phi", "U", "c", "alpha", "velocity_x", "velocity_y", "pressure", "level", "rank", "grain"],
           3: ["phi", "U", "c", "alpha", "velocity_x", "velocity_y", "velocity_z", "pressure", "level", "rank", "grain"]}
-MANIFEST = ["version", "git_hash", "compiler", "flags", "ranks", "threads", "machine", "input", "start", "end", "status",
-            "wall_s", "wall_by_phase"]
+MANIFEST = ["version", "git_hash", "compiler", "flags", "ranks", "threads", "machine", "input", "start", "end",
+            "status", "wall_s", "wall_by_phase"]
 KEYS = ["run.end_time_s", "run.max_steps", "run.wall_clock_limit_s", "output.dir", "output.plot_every_s",
         "output.checkpoint_every_s", "mesh.dim"]  # those that scripts override
 
@@ -123,7 +122,8 @@ def check_command_line(folder):
             require(word in text, f"{option} does not mention {word}: {text}")
     keys = {2: key_names(run("--keys", cwd=folder).out), 3: key_names(run("--keys", "mesh.dim=3", cwd=folder).out)}
     require(set(KEYS) <= set(keys[2]), f"--keys lacks {set(KEYS) - set(keys[2])}")
-    require(set(keys[2]) | {"mesh.zlo", "mesh.zhi"} == set(keys[3]), "--keys in 3D: the keys of 2D, zlo and zhi expected")
+    require(set(keys[2]) | {"mesh.zlo", "mesh.zhi"} == set(keys[3]),
+            "--keys in 3D: the keys of 2D, zlo and zhi expected")
     require(not names(folder), f"{names(folder)} appeared")
     say("--version, --help, --keys")
     return keys
@@ -159,8 +159,8 @@ def check_files(folder, dim, keys):
     plot_every, check_every = 2 * TAU0_S, 1 * TAU0_S
     out.mkdir()
     (out / "notes.txt").write_text("not the program's\n")
-    run(scene, f"output.plot_every_s={plot_every}", f"output.checkpoint_every_s={check_every}", "output.dir=out", ranks=2,
-        threads=2, cwd=folder)
+    run(scene, f"output.plot_every_s={plot_every}", f"output.checkpoint_every_s={check_every}", "output.dir=out",
+        ranks=2, threads=2, cwd=folder)
 
     # 1. Names: plotfiles at 0, 2, 4 and at the end, 5; the last two of the checkpoints at 1, 2, 3, 4
     times = [round(t, 9) for t in column(out / "diagnostics.csv", "time_tau0")]
@@ -169,7 +169,8 @@ def check_files(folder, dim, keys):
     plots = {f"plt_{steps[t]:07d}.hdf": t for t in (0, 2, 4, 5)}
     checkpoints = {f"chk_{steps[t]:07d}.h5": t for t in (3, 4)}
     fixed = {"diagnostics.csv", "tips.csv", "manifest.json", "plt.hdf.series", "notes.txt"}
-    require(names(out) - {"grains.csv"} == fixed | plots.keys() | checkpoints.keys(), f"{dim}D: files {sorted(names(out))}")
+    require(names(out) - {"grains.csv"} == fixed | plots.keys() | checkpoints.keys(),
+            f"{dim}D: files {sorted(names(out))}")
 
     # 2. Columns
     n = 8**dim
@@ -183,7 +184,8 @@ def check_files(folder, dim, keys):
         require(line["cells"] == n * line["blocks"] and 1 <= line["levels"] <= 4, f"{dim}D: {line}")
         require(abs(line["solute_drift_rel"]) < 1e-13, f"{dim}D: solute is lost: {line}")
     for name in ("step", "time_s", "solid_fraction", "wall_s"):
-        require(all(a < b for a, b in zip(table[name], table[name][1:])), f"{dim}D: {name} does not rise: {table[name]}")
+        require(all(a < b for a, b in zip(table[name], table[name][1:])),
+                f"{dim}D: {name} does not rise: {table[name]}")
     # (1 + tanh((R-r)/sqrt 2))/2 over a quarter of a disc or an eighth of a ball of R = 8: a smeared edge of variance
     # pi^2/6 adds to them; the sum over cells of size 1 comes within 1e-4 of the integral.
     solid = (math.pi / 4 * (64 + math.pi**2 / 6) / (128 * 64) if dim == 2 else
@@ -325,7 +327,7 @@ def check_numerical_failure(folder):
         require(len(re.findall(r"not finite at step \d+", result.err)) == 1, f"no cause, or more than one: {result}")
         manifest = json.loads((folder / "out/manifest.json").read_text())
         require("not finite" in manifest["status"], f"status {manifest['status']}")
-        saved = [p for p in names(folder / "out") if p.endswith(f"_{manifest['steps']:07d}.h5") and p != checkpoint.name]
+        saved = [n for n in names(folder / "out") - {checkpoint.name} if n.endswith(f"_{manifest['steps']:07d}.h5")]
         require(saved, f"the state of step {manifest['steps']} was not saved: {sorted(names(folder / 'out'))}")
         (folder / "out" / saved[0]).unlink()
     say("numerical failure: exit code 3, cause, state")
@@ -376,8 +378,8 @@ def check_bad_restarts(folder):
     # What each message must say beside the name of the file
     cases = {"missing.h5": "no such file", "missing/folder": "no such file", "run2/plt_0000000.hdf": "not a checkpoint",
              "run2/manifest.json": "open", "garbage.h5": "open", "empty.h5": "open", "cut.h5": "truncated",
-             "nothing_in_it": "no checkpoint", "run3": "2D", "no_fields.h5": "fields", "no_leaves.h5": "not a checkpoint",
-             "later_format.h5": "99", "no_next_regrid.h5": "", "bad_leaf.h5": ""}
+             "nothing_in_it": "no checkpoint", "run3": "2D", "no_fields.h5": "fields",
+             "no_leaves.h5": "not a checkpoint", "later_format.h5": "99", "no_next_regrid.h5": "", "bad_leaf.h5": ""}
     (folder / "out").mkdir()
     (folder / "out/plt_0000000.hdf").write_text("an earlier run's\n")
     before = snapshot(folder)

@@ -184,7 +184,8 @@ def check_scene(name, numbers, text):
     blocks = column(folder / "reference/diagnostics.csv", "blocks", int)
     changes = sum(a != b for a, b in zip(blocks, blocks[1:]))
     levels = max(column(folder / "reference/diagnostics.csv", "levels", int))
-    require(changes >= 3 and levels >= 3, f"{name}: {changes} changes of the number of blocks {blocks}, {levels} levels")
+    require(changes >= 3 and levels >= 3,
+            f"{name}: {changes} changes of the number of blocks {blocks}, {levels} levels")
     require(len(reference.checkpoints) >= 3, f"{name}: only {len(reference.checkpoints)} checkpoints")
     require(len(reference.tips[1]) >= 4 * len(reference.diagnostics) // 2, f"{name}: too few tips found")
 

@@ -3,7 +3,6 @@
 touched. The inputs are in malformed/, what is said about them in malformed/expected.toml."""
 import os
 import re
-import shutil
 import sys
 import tomllib
 from pathlib import Path

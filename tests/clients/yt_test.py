@@ -119,8 +119,8 @@ def main():
         require(len(files) == 3, f"{dim}D: {len(files)} plotfiles, three were asked for")
         seen = [check_plotfile(file, dim, rows, 2) for file in files]
         require(len({cells for cells, _ in seen}) > 1, f"{dim}D: the mesh never changed")
-        say(f"{dim}D: {len(files)} plotfiles, {seen[-1][0]} cells, {seen[-1][1]} blocks in the last: fields, integrals, "
-            "counts, time and U(c, phi) as in diagnostics.csv")
+        say(f"{dim}D: {len(files)} plotfiles, {seen[-1][0]} cells, {seen[-1][1]} blocks in the last: fields, "
+            "integrals, counts, time and U(c, phi) as in diagnostics.csv")
 
 
 main()

@@ -14,11 +14,13 @@ import numpy as np
 
 BUILD, SOURCE = Path(sys.argv[1]).resolve(), Path(sys.argv[2]).resolve()
 PROGRAM = BUILD / "dendrift"
-# Open MPI as root, on fewer cores than ranks; a program alone starts without a daemon. Other MPIs ignore these.
+# Open MPI as root, on fewer cores than ranks (waiting ranks let others work); a program alone starts without a daemon.
+# Other MPIs ignore these.
 ENVIRONMENT = {
     "OMPI_ALLOW_RUN_AS_ROOT": "1", "OMPI_ALLOW_RUN_AS_ROOT_CONFIRM": "1", "OMPI_MCA_ess_singleton_isolated": "1",
     "OMPI_MCA_pml": "ob1", "OMPI_MCA_btl": "self,vader", "OMPI_MCA_osc": "^ucx",
-    "OMPI_MCA_btl_vader_single_copy_mechanism": "none", "OMP_WAIT_POLICY": "passive"}
+    "OMPI_MCA_btl_vader_single_copy_mechanism": "none", "OMPI_MCA_mpi_yield_when_idle": "1",
+    "OMP_WAIT_POLICY": "passive"}
 CRASH_WORDS = ("terminate called", "Segmentation fault", "Assertion", "core dumped", "runtime error:",
                "AddressSanitizer", "Sanitizer:", "what():", "MPI_ABORT", "Signal:", "Traceback", "HDF5-DIAG")
 
@@ -90,7 +92,8 @@ def snapshot(folder):
     def state(path):
         if path.is_symlink() or not path.is_file():
             return "link" if path.is_symlink() else "folder" if path.is_dir() else "other"
-        return hashlib.sha256(path.read_bytes()).hexdigest() if os.access(path, os.R_OK) else "", path.stat().st_mtime_ns
+        content = hashlib.sha256(path.read_bytes()).hexdigest() if os.access(path, os.R_OK) else "unreadable"
+        return content, path.stat().st_mtime_ns
     return {str(p.relative_to(folder)): state(p) for p in sorted(Path(folder).rglob("*"))}
 
 
