@@ -17,7 +17,7 @@ CommandLine parse_command_line(int argc, char** argv, bool print) {
   app.add_flag("--check", c.check, "validate the input, print derived numbers and an estimate of the cost, and stop");
   app.add_flag("--keys", c.keys, "list every key of the input: unit, default, range, meaning");
   app.add_flag("--markdown", c.markdown, "with --keys: as the page docs/keys.md");
-  app.add_option("--restart", c.restart, "checkpoint, or a folder of checkpoints, to continue from");
+  const CLI::Option* restart = app.add_option("--restart", c.restart, "checkpoint, or a folder of checkpoints, to continue from");
   app.add_flag("--version", version, "version, commit, compiler and flags");
   try {
     app.parse(argc, argv);
@@ -34,6 +34,11 @@ CommandLine parse_command_line(int argc, char** argv, bool print) {
     return c;
   }
   if (c.keys) return c;
+  if (restart->count() > 0 && c.restart.empty()) {
+    if (print) fmt::print(stderr, "dendrift: --restart: expected a checkpoint or a folder of checkpoints, found nothing\n");
+    c.exit_code = 2;
+    return c;
+  }
   if (words.empty()) {
     if (print) fmt::print(stderr, "dendrift: no input file; usage: dendrift INPUT.toml [section.key=value ...]\n");
     c.exit_code = 2;

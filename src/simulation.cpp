@@ -104,8 +104,13 @@ void Simulation::resume(const std::string& file) {
   };
   if (list("shape") != shape_numbers(settings_, crystals_.size()))
     throw io::OutputError(file, "restart", "the input describes another box, mesh, alloy or set of seeds than the checkpoint");
-  amr::Tree tree(settings_.shape.root_blocks, settings_.shape.periodic(), settings_.shape.max_level,
-                 io::read_leaves(file, comm_));
+  amr::Tree tree = mesh_->tree();
+  try {
+    tree = amr::Tree(settings_.shape.root_blocks, settings_.shape.periodic(), settings_.shape.max_level,
+                     io::read_leaves(file, comm_));
+  } catch (const std::invalid_argument& e) {
+    throw io::OutputError(file, "restart", e.what());
+  }
   const std::vector<double> weights(at(tree.size()), 1.0);
   std::vector<int> owners = amr::partition(settings_.parallel.partitioner, tree, weights, mesh_->ranks());
   for (const amr::Block& b : mesh_->blocks()) mesh_->release_slot(b.slot);

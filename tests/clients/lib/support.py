@@ -21,6 +21,11 @@ ENVIRONMENT = {
     "OMPI_MCA_pml": "ob1", "OMPI_MCA_btl": "self,vader", "OMPI_MCA_osc": "^ucx",
     "OMPI_MCA_btl_vader_single_copy_mechanism": "none", "OMPI_MCA_mpi_yield_when_idle": "1",
     "OMP_WAIT_POLICY": "passive"}
+# A folder of its own for session files: two such programs on one machine would remove each other's.
+ENVIRONMENT["OMPI_MCA_orte_tmpdir_base"] = tempfile.mkdtemp(prefix="dendrift_mpi_")
+os.chmod(ENVIRONMENT["OMPI_MCA_orte_tmpdir_base"], 0o1777)  # run(user=...) needs it as well
+os.chmod(ENVIRONMENT["OMPI_MCA_orte_tmpdir_base"], 0o1777)  # some tests run as another user
+atexit.register(shutil.rmtree, ENVIRONMENT["OMPI_MCA_orte_tmpdir_base"], ignore_errors=True)
 CRASH_WORDS = ("terminate called", "Segmentation fault", "Assertion", "core dumped", "runtime error:",
                "AddressSanitizer", "Sanitizer:", "what():", "MPI_ABORT", "Signal:", "Traceback", "HDF5-DIAG")
 
