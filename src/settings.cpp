@@ -6,6 +6,18 @@
 
 namespace dendrift {
 
+namespace {
+
+// One quantity in two units: an override in one replaces what the file says in the other.
+template <class T>
+void override_twin(const io::Checks& c, const std::string& a, std::optional<T>& x, const std::string& b,
+                   std::optional<T>& y) {
+  if (!x || !y || c.overridden(a) == c.overridden(b)) return;
+  (c.overridden(a) ? y : x).reset();
+}
+
+}  // namespace
+
 void RunOptions::declare(io::Schema& schema) {
   io::Table& t = schema.table("run", "how long", io::Schema::Presence::required);
   t.text("title", title).doc("for the reader; goes into manifest.json");
@@ -17,7 +29,8 @@ void RunOptions::declare(io::Schema& schema) {
       .at_least(0)
       .doc("running time after which a checkpoint is written and the program ends with exit code 75; 0: none");
   schema.check({"run"}, [this](io::Checks& c) {
-    if (c.given("run.end_time_s") == c.given("run.end_time_tau0"))
+    override_twin(c, "run.end_time_s", end_time_s, "run.end_time_tau0", end_time_tau0);
+    if (end_time_s.has_value() == end_time_tau0.has_value())
       c.fail("run", "exactly one of end_time_s and end_time_tau0", end_time_s ? "both" : "neither");
   });
 }
@@ -40,6 +53,7 @@ void MeshOptions::declare(io::Schema& schema) {
   t.integer("max_regrid_steps", max_regrid_steps).range(1, 1000).doc("steps between changes of the mesh at most");
   schema.check({"mesh"}, [this](io::Checks& c) {
     if (dim != DIM) return;  // the launcher picks the program; nothing else can be right in the wrong one
+    override_twin(c, "mesh.size_um", size_um, "mesh.size_W0", size_w0);
     if (size_um.has_value() == size_w0.has_value())
       c.fail("mesh", "exactly one of size_um and size_W0", size_um ? "both" : "neither");
     if (block_cells != 8 && block_cells != 16 && block_cells != 32) c.fail("mesh.block_cells", "8, 16 or 32");
@@ -71,6 +85,9 @@ void OutputOptions::declare(io::Schema& schema) {
   t.integer("checkpoint_every_steps", checkpoint_every_steps).at_least(0).doc("time steps between checkpoints; 0: none");
   t.integer("keep_checkpoints", keep_checkpoints).at_least(1).doc("checkpoints kept; older ones are removed");
   schema.check({"output"}, [this](io::Checks& c) {
+    override_twin(c, "output.plot_every_s", plot_every_s, "output.plot_every_tau0", plot_every_tau0);
+    override_twin(c, "output.diagnostics_every_s", diagnostics_every_s, "output.diagnostics_every_tau0",
+                  diagnostics_every_tau0);
     if (plot_every_s && plot_every_tau0) c.fail("output.plot_every_tau0", "not together with plot_every_s");
     if (diagnostics_every_s && diagnostics_every_tau0)
       c.fail("output.diagnostics_every_tau0", "not together with diagnostics_every_s");

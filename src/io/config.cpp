@@ -622,6 +622,11 @@ Schema::Place Schema::place_of(const std::string& key) const {
   return place;
 }
 
+bool Checks::overridden(const std::string& key) const {
+  const auto place = schema_.given_.find(key);
+  return place != schema_.given_.end() && place->second.where == "command line";
+}
+
 void Checks::fail(const std::string& key, std::string expected, std::string found) {
   Schema::Place place = schema_.place_of(key);
   if (!found.empty()) place.found = std::move(found);

@@ -336,6 +336,8 @@ class Checks {
   void fail(const std::string& key, std::string expected, std::string found = {});
   bool given(const std::string& key) const { return schema_.given(key); }
   bool has_table(const std::string& name) const { return schema_.has_table(name); }
+  /// Given on the command line, which wins over the file.
+  bool overridden(const std::string& key) const;
 
  private:
   Schema& schema_;
