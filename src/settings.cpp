@@ -1,8 +1,11 @@
 #include "settings.hpp"
 
 #include <algorithm>
+#include <array>
 #include <cmath>
+#include <optional>
 #include <stdexcept>
+#include <utility>
 
 namespace dendrift {
 
@@ -176,33 +179,37 @@ amr::MeshShape choose_shape(const RealVec& size, const MeshOptions& o) {
         throw std::invalid_argument("root_blocks in proportion to the sides of the box, so that cells are cubes");
     return shape;
   }
-  // Deep trees first: few root blocks are what multigrid wants; accept the first that wastes less than 7 %.
-  double best = 0;
-  for (int level = 14; level >= 0; --level) {
+  // The tree of `level` refinements with the coarsest cells that are not above dx_w0; none if its blocks do not tile.
+  const auto tree = [&](int level) -> std::optional<amr::MeshShape> {
     const double unit = n * static_cast<double>(1 << level);
     const int least = std::max(1, static_cast<int>(std::ceil(size[0] / (unit * o.dx_w0) - 1e-9)));
     for (int r = least; r < least + 16; ++r) {
-      IntVec roots{};
       bool fits = true;
       for (int a = 0; a < DIM; ++a) {
         const double x = size[a] / size[0] * r;
         fits = fits && near_integer(x) && std::round(x) >= 1;
-        roots[a] = static_cast<int>(std::round(x));
+        shape.root_blocks[a] = static_cast<int>(std::round(x));
       }
       if (!fits) continue;
-      const double dx = size[0] / (unit * r);
-      if (dx > best) {
-        best = dx;
-        shape.root_blocks = roots;
-        shape.max_level = level;
-        shape.root_dx = size[0] / (n * r);
-      }
-      break;
+      shape.max_level = level;
+      shape.root_dx = size[0] / (n * r);
+      return shape;
     }
-    if (best >= 0.93 * o.dx_w0) return shape;
-  }
-  if (best == 0) throw std::invalid_argument("sides in the ratio of small whole numbers, so that cubes tile the box");
-  return shape;
+    return std::nullopt;
+  };
+  // Deep trees first: few root blocks are what multigrid wants. Cells a little smaller than asked for are a price worth
+  // paying for them.
+  constexpr std::array<std::pair<int, double>, 4> PREFERENCES{{{2, 0.93}, {2, 0.8}, {1, 0.93}, {2, 0.6}}};
+  constexpr int DEEPEST = 14;
+  for (const auto& [fewest_levels, least_dx] : PREFERENCES)
+    for (int level = DEEPEST; level >= fewest_levels; --level)
+      if (const auto found = tree(level); found && found->dx(level) >= (least_dx - 1e-9) * o.dx_w0) return *found;
+  std::optional<amr::MeshShape> coarsest;
+  for (int level = DEEPEST; level >= 0; --level)
+    if (const auto found = tree(level); found && (!coarsest || found->dx(level) > coarsest->dx(coarsest->max_level)))
+      coarsest = found;
+  if (coarsest) return *coarsest;
+  throw std::invalid_argument("sides in the ratio of small whole numbers, so that cubes tile the box");
 }
 
 }  // namespace dendrift

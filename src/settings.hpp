@@ -90,7 +90,8 @@ class Settings {
   void derive();
 };
 
-/// Root blocks and levels whose finest cubic cells are the largest that do not exceed dx, with few root blocks.
+/// Root blocks and levels whose finest cubic cells do not exceed dx: few root blocks under a deep tree, as long as the
+/// cells are not much smaller than dx (7 %; 20 or 40 % where only that gives three levels).
 /// Throws std::invalid_argument with the reason if the box cannot be tiled.
 amr::MeshShape choose_shape(const RealVec& size, const MeshOptions& options);
 

@@ -56,11 +56,9 @@ def width_rows():
 
 
 def karma_rows():
-    runs = {}
-    for r in rows("karma_2001"):
-        runs.setdefault((r["W0_over_d0"], r["dx_W0"]), []).append(r)
-    return [[*key, *(num(r["V_d0_over_D"], 4)[1:] for r in run), num(run[-1]["c_s_over_c_l"], 3)[1:]]
-            for key, run in runs.items()]
+    return [[r["program"], r["W0_over_d0"], r["dx_W0"], num(r["anisotropy"], 4)[1:],
+             *(num(r[f"V_{t}"], 4)[1:] for t in (1000, 2000, 4000, 5000, 8000, 9900)),
+             num(r["c_s_over_c_l"], 3)[1:] if r["c_s_over_c_l"] else ""] for r in rows("karma_2001")]
 
 
 TABLES = {

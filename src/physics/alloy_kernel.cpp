@@ -62,26 +62,88 @@ double solid_offset() {
   return 1.0 / (1.0 + e * e);
 }
 
+// Calls f(shift + q) for FIRST <= q <= LAST in whole vectors: the last one goes back over cells already done, which
+// costs less than a loop over the few left. f must not mind being called twice.
+template <int FIRST, int LAST, class F>
+[[gnu::always_inline]] inline void run(int shift, F&& f) {
+  constexpr int VECTOR = 8, COUNT = LAST - FIRST + 1, WHOLE = COUNT / VECTOR * VECTOR;
+  const int first = shift + FIRST, last = shift + LAST;
+#pragma omp simd
+  for (int q = first; q < first + WHOLE; ++q) f(q);
+  if constexpr (WHOLE < COUNT) {
+#pragma omp simd
+    for (int q = last - VECTOR + 1; q <= last; ++q) f(q);
+  }
+}
+
+// f(q) for the cells of a block and their nearest neighbours (3D: without the edges of that cube). Between pieces of
+// the work meanwhile(piece, pieces) is called.
+template <int N, class F, class Meanwhile>
+[[gnu::always_inline]] inline void around(F&& f, Meanwhile&& meanwhile) {
+  using S = Shape<N>;
+  constexpr int FIRST = S::index(-1, -1, 0), LAST = S::index(N, N, 0);
+  if constexpr (DIM == 2) {
+    constexpr int PIECE = 64, PIECES = (LAST - FIRST + 1) / PIECE;
+    for (int i = 0; i < PIECES - 1; ++i) {
+      meanwhile(i, PIECES);
+      run<FIRST, FIRST + PIECE - 1>(i * PIECE, f);
+    }
+    meanwhile(PIECES - 1, PIECES);
+    run<FIRST + (PIECES - 1) * PIECE, LAST>(0, f);
+  } else {
+    for (int k = -1; k <= N; ++k) {
+      meanwhile(k + 1, N + 2);
+      if (k < 0 || k == N) {
+        run<S::index(-1, 0, 0), S::index(N, N - 1, 0)>(k * S::Z, f);
+      } else {
+        run<FIRST, LAST>(k * S::Z, f);
+      }
+    }
+  }
+}
+
+// f(q) for the cells on the low side of every face across AXIS.
+template <int N, int AXIS, class F>
+[[gnu::always_inline]] inline void faces(F&& f) {
+  using S = Shape<N>;
+  constexpr int FIRST = S::index(AXIS == 0 ? -1 : 0, AXIS == 1 ? -1 : 0, 0), LAST = S::index(N - 1, N - 1, 0);
+  if constexpr (DIM == 2) {
+    run<FIRST, LAST>(0, f);
+  } else {
+    for (int k = AXIS == 2 ? -1 : 0; k < N; ++k) run<FIRST, LAST>(k * S::Z, f);
+  }
+}
+
+// Asks for one of `pieces` parts of the interior of an array.
+template <int N>
+[[gnu::always_inline]] inline void fetch(const double* array, int piece, int pieces) {
+  if (array == nullptr) return;
+  constexpr int COUNT = Shape<N>::index(N - 1, N - 1, N - 1) + 1, LINE = 8;
+  for (int q = COUNT * piece / pieces; q < COUNT * (piece + 1) / pieces; q += LINE) __builtin_prefetch(array + q, 1);
+}
+
 template <int N>
 void primitives(const double* psi, const double* c, double k, Scratch<N>& s) {
   using S = Shape<N>;
   const double scale = 1.0 / SQRT2, rk = 1.0 / (1.0 - k);
-  constexpr int first = S::index(-1, -1, -1), last = S::index(N, N, N);
   double* e_ = s.e + S::ORIGIN;
   double* t_ = s.t + S::ORIGIN;
   double* u_ = s.u + S::ORIGIN;
-#pragma omp simd
-  for (int q = first; q <= last; ++q) {
-    const double e = fast_exp(psi[q] * scale);
-    const double a = 1.0 + e * e, b = 1.0 + k * e * e;
-    const double inverse = 1.0 / (a * b);
-    e_[q] = e;
-    t_[q] = inverse * b;                                // 1/(1+e^2)
-    u_[q] = (c[q] * (inverse * a * a) - 1.0) * rk;      // [1+k-(1-k)phi]/2 = b/a
-  }
+  around<N>(
+      [=](int q) __attribute__((always_inline)) {
+        const double e = fast_exp(psi[q] * scale);
+        const double a = 1.0 + e * e, b = 1.0 + k * e * e;
+        const double inverse = 1.0 / (a * b);
+        e_[q] = e;
+        t_[q] = inverse * b;                            // 1/(1+e^2)
+        u_[q] = (c[q] * (inverse * a * a) - 1.0) * rk;  // [1+k-(1-k)phi]/2 = b/a
+      },
+      [](int, int) {});
 }
 
-// Derivatives of psi at a cell; gradient and Laplacian with isotropic leading errors.
+// Derivatives of psi at a cell, in units of the grid that save products: p is 12 h grad psi, m the Hessian times h^2
+// on the diagonal and 4 h^2 beside it, laplacian 6 h^2 div grad psi. Gradient and Laplacian have isotropic leading
+// errors.
 struct Derivatives {
   double p[DIM];
   double m[DIM][DIM];
@@ -89,37 +151,38 @@ struct Derivatives {
 };
 
 template <int N>
-[[gnu::always_inline]] inline void derivatives(const double* f, double h, Derivatives& d) {
+[[gnu::always_inline]] inline void derivatives(const double* f, Derivatives& d) {
   using S = Shape<N>;
-  const double h2 = h * h;
-  double trace = 0, pairs = 0;  // sums of delta_a^2, and of delta_a^2 delta_b^2 over pairs of axes
-  double across[DIM] = {};      // what the other axes add to the gradient
+  constexpr double NEAR = DIM == 2 ? 4.0 : 2.0, CENTRAL = DIM == 2 ? 20.0 : 24.0;
+  double across[DIM] = {}, faces = 0, edges = 0;
   EACH_AXIS(a)
     constexpr int s = S::stride(a);
-    d.m[a][a] = h2 * (f[s] - 2.0 * f[0] + f[-s]);
-    trace += d.m[a][a];
+    const double sum = f[s] + f[-s];
+    d.m[a][a] = sum - 2.0 * f[0];
+    faces += sum;
   END_AXIS
   EACH_AXIS(a)
     EACH_AXIS(b)
       if constexpr (b > a) {
         constexpr int s = S::stride(a), r = S::stride(b);
         const double pp = f[s + r], pm = f[s - r], mp = f[-s + r], mm = f[-s - r];
-        d.m[a][b] = d.m[b][a] = 0.25 * h2 * ((pp - pm) - (mp - mm));
-        pairs += ((pp + mm) + (pm + mp)) - 2.0 * ((f[s] + f[-s]) + (f[r] + f[-r])) + 4.0 * f[0];
-        across[a] += ((pp - mm) + (pm - mp)) - 2.0 * (f[s] - f[-s]);
-        across[b] += ((pp - mm) - (pm - mp)) - 2.0 * (f[r] - f[-r]);
+        d.m[a][b] = d.m[b][a] = (pp + mm) - (pm + mp);
+        edges += (pp + mm) + (pm + mp);
+        across[a] += (pp - mm) + (pm - mp);
+        across[b] += (pp - mm) - (pm - mp);
       }
     END_AXIS
   END_AXIS
   EACH_AXIS(a)
     constexpr int s = S::stride(a);
-    d.p[a] = 0.5 * h * ((f[s] - f[-s]) + across[a] / 6.0);
+    d.p[a] = NEAR * (f[s] - f[-s]) + across[a];
   END_AXIS
-  d.laplacian = trace + h2 * (1.0 / 6.0) * pairs;
+  d.laplacian = (NEAR * faces + edges) - CENTRAL * f[0];
 }
 
 // The same derivatives along the crystal's axes.
-[[gnu::always_inline]] inline void rotate(const Derivatives& d, const double (&axes)[DIM][DIM], Derivatives& r) {
+[[gnu::always_inline]] inline void rotate(Derivatives& d, const double (&axes)[DIM][DIM], Derivatives& r) {
+  EACH_AXIS(i) d.m[i][i] *= 4.0; END_AXIS
   double half[DIM][DIM];
   EACH_AXIS(i)
     r.p[i] = 0;
@@ -135,76 +198,76 @@ template <int N>
       EACH_AXIS(a) r.m[i][j] += half[i][a] * axes[j][a]; END_AXIS
     END_AXIS
   END_AXIS
+  EACH_AXIS(i) r.m[i][i] *= 0.25; END_AXIS
   r.laplacian = d.laplacian;
 }
 
 // Eq. (1) divided by a_s^2 d phi/d psi: with phi = tanh(psi/sqrt 2) and F the homogeneous vector
 // a_s^2 grad psi + |grad psi|^2 a_s d a_s/d(grad psi),
 //   a_s^2 D_t psi = div F + sqrt2 phi (1 - a_s^2 |grad psi|^2) - sqrt2 lambda (1 - phi^2) U.
-// div F is expanded as Hessian of (a_s^2 p^2 / 2) : grad grad psi, all in products of n_i n_j: no trigonometry.
+// div F is expanded as Hessian of (a_s^2 p^2 / 2) : grad grad psi. With n = p/|p|, S = sum n_i^4, x_i = n_i^2 - S:
+//   div F = (a_s^2 - 16 eps a_s S) lap + 16 eps sum_ij n_i n_j [16 eps x_i x_j + s_i + s_j + 3 a_s delta_ij] M_ij,
+//   s_i = -a_s (2 x_i + S): products of n_i n_j only, no trigonometry.
 template <int N, bool Rotated>
-void phase_rate(const double* psi, const AlloyParameters& par, double dx, Scratch<N>& s) {
+void phase_rate(const AlloyBlock& blk, const AlloyParameters& par, Scratch<N>& s) {
   using S = Shape<N>;
-  const double h = 1.0 / dx;
-  const double b = 1.0 - 3.0 * par.epsilon, e4 = 4.0 * par.epsilon;
-  const double drive = SQRT2 * par.lambda;
+  const double* psi = blk.psi;
+  const double h = 1.0 / blk.dx, h2 = h * h;
+  const double b = 1.0 - 3.0 * par.epsilon, e4 = 4.0 * par.epsilon, e16 = 16.0 * par.epsilon;
+  const double drive = 4.0 * SQRT2 * par.lambda, tiny = 1e-12 * 144.0 / h2, to_p2 = h2 / 144.0;
   double axes[DIM][DIM];
   for (int i = 0; i < DIM; ++i)
     for (int a = 0; a < DIM; ++a) axes[i][a] = par.axes[i][a];
   const double* t_ = s.t + S::ORIGIN;
   const double* u_ = s.u + S::ORIGIN;
   double* rate_ = s.rate + S::ORIGIN;
-  constexpr int first = S::index(-1, -1, -1), last = S::index(N, N, N);
-#pragma omp simd
-  for (int q = first; q <= last; ++q) {
+  const auto rate = [=](int at) __attribute__((always_inline)) {
     Derivatives d;
     if constexpr (Rotated) {
       Derivatives lab;
-      derivatives<N>(psi + q, h, lab);
+      derivatives<N>(psi + at, lab);
       rotate(lab, axes, d);
     } else {
-      derivatives<N>(psi + q, h, d);
+      derivatives<N>(psi + at, d);
     }
-    double p2 = 1e-12, p4 = 0;
+    double q[DIM], p2 = tiny, p4 = 0;
     EACH_AXIS(i)
-      const double sq = d.p[i] * d.p[i];
-      p2 += sq;
-      p4 += sq * sq;
+      q[i] = d.p[i] * d.p[i];
+      p2 += q[i];
+      p4 += q[i] * q[i];
     END_AXIS
-    const double m = b * p2 * p2 + e4 * p4;  // a_s |grad psi|^4
+    const double p22 = p2 * p2, m = b * p22 + e4 * p4;  // a_s |p|^4
     const double inverse = 1.0 / (p2 * m);
-    const double ip2 = inverse * m;
-    const double ratio = inverse * p2 * p2 * p2;  // 1 / a_s
-    const double a = m * ip2 * ip2;
-    const double sum4 = p4 * ip2 * ip2;  // sum n_i^4
-    double nmn = 0, wmn = 0, wmw = 0, nnm = 0;
-    double g[DIM];
+    const double ip2 = inverse * m, ip4 = ip2 * ip2;
+    const double ratio = inverse * p2 * p22;  // 1 / a_s
+    const double a = m * ip4, sum4 = p4 * ip4, as = a * sum4;
+    double x[DIM], y[DIM], w[DIM];  // w is -s
     EACH_AXIS(i)
-      const double ni2 = d.p[i] * d.p[i] * ip2;
-      g[i] = d.p[i] * (ni2 - sum4);  // |grad psi| (n_i^3 - n_i sum4)
-      nnm += ni2 * d.m[i][i];
+      x[i] = q[i] * ip2 - sum4;
+      y[i] = e16 * x[i];
+      w[i] = (a + a) * x[i] + as;
     END_AXIS
+    double diagonal = 0, beside = 0;
     EACH_AXIS(i)
-      double mp = 0, mg = 0;
+      diagonal += q[i] * ((y[i] * x[i] + 3.0 * a) - (w[i] + w[i])) * d.m[i][i];
       EACH_AXIS(j)
-        mp += d.m[i][j] * d.p[j];
-        mg += d.m[i][j] * g[j];
+        if constexpr (j > i) beside += (d.p[i] * d.p[j]) * (y[i] * x[j] - (w[i] + w[j])) * d.m[i][j];
       END_AXIS
-      nmn += d.p[i] * mp;
-      wmn += g[i] * mp;
-      wmw += g[i] * mg;
     END_AXIS
-    nmn *= ip2;
-    wmn *= ip2;
-    wmw *= ip2;
-    const double div = a * a * d.laplacian + 16.0 * e4 * e4 * wmw +
-                       4.0 * e4 * a * (3.0 * nnm - sum4 * d.laplacian - 2.0 * sum4 * nmn - 4.0 * wmn);
-    const double t = t_[q], phi = 1.0 - 2.0 * t;
-    const double r =
-        ratio * ratio * (div + SQRT2 * phi * (1.0 - std::min(a * a * p2, STEEPEST)) - drive * 4.0 * t * (1.0 - t) * u_[q]);
-    const bool held = (psi[q] >= PSI_MAX && r > 0) || (psi[q] <= -PSI_MAX && r < 0);
-    rate_[q] = held ? 0.0 : r;
-  }
+    const double a2 = a * a;
+    const double div =
+        h2 * ((1.0 / 6.0) * (a2 - e16 * as) * d.laplacian + (e16 * ip2) * (diagonal + 0.5 * beside));
+    const double t = t_[at], phi = 1.0 - 2.0 * t;
+    const double r = ratio * ratio *
+                     (div + SQRT2 * phi * (1.0 - std::min(a2 * (to_p2 * p2), STEEPEST)) - drive * (t - t * t) * u_[at]);
+    const bool held = (psi[at] >= PSI_MAX && r > 0) || (psi[at] <= -PSI_MAX && r < 0);
+    rate_[at] = held ? 0.0 : r;
+  };
+  // This is the pass with the most arithmetic: the data that the later ones need come from memory meanwhile.
+  around<N>(rate, [&](int piece, int pieces) {
+    const double* const later[] = {blk.psi_next, blk.c_next, blk.ahead[0], blk.ahead[1]};
+    for (const double* array : later) fetch<N>(array, piece, pieces);
+  });
 }
 
 // splitmix64: a counter in, 64 well-mixed bits out; the same on any number of ranks.
@@ -257,8 +320,6 @@ template <int N, int AXIS>
 void solute_flux(const double* psi, const double* anti, const AlloyParameters& par, double dx, Scratch<N>& s) {
   using S = Shape<N>;
   constexpr int A = S::stride(AXIS);
-  constexpr int first = S::index(AXIS == 0 ? -1 : 0, AXIS == 1 ? -1 : 0, AXIS == 2 ? -1 : 0);
-  constexpr int last = S::index(N - 1, N - 1, N - 1);
   const double h = 1.0 / dx, k1 = 1.0 - par.k;
   const double diffusion = k1 * par.diffusivity * h, offset = solid_offset();
   // D_t phi = sqrt2 (1-phi^2)/2 D_t psi and (1-phi^2) = 4 r (1-r); psi's rate is averaged from two cells.
@@ -266,23 +327,22 @@ void solute_flux(const double* psi, const double* anti, const AlloyParameters& p
   const double* e_ = s.e + S::ORIGIN;
   const double* u_ = s.u + S::ORIGIN;
   double* flux_ = s.flux[AXIS] + S::ORIGIN;
-#pragma omp simd
-  for (int q = first; q <= last; ++q) {
+  faces<N, AXIS>([=](int q) __attribute__((always_inline)) {
     const double dn = psi[q + A] - psi[q];
-    double g2 = dn * dn + 1e-24;
+    double tangential = 0;
     EACH_AXIS(b)
       if constexpr (b != AXIS) {
         constexpr int B = S::stride(b);
-        const double dt = 0.25 * ((psi[q + B] - psi[q - B]) + (psi[q + A + B] - psi[q + A - B]));
-        g2 += dt * dt;
+        const double dt = (psi[q + B] - psi[q - B]) + (psi[q + A + B] - psi[q + A - B]);
+        tangential += dt * dt;
       }
     END_AXIS
-    const double normal = dn * fast_rsqrt(g2);
+    const double normal = dn * fast_rsqrt((dn * dn + 1e-24) + 0.0625 * tangential);
     const double r = 1.0 / (1.0 + e_[q] * e_[q + A]);
     const double enrichment = 1.0 + 0.5 * k1 * (u_[q] + u_[q + A]);
     flux_[q] = diffusion * (r - offset) * (u_[q + A] - u_[q]) +
-               trapping * r * (1.0 - r) * (anti[q] + anti[q + A]) * enrichment * normal;
-  }
+               (trapping * (r - r * r)) * ((anti[q] + anti[q + A]) * enrichment) * normal;
+  });
 }
 
 template <int N>
@@ -368,9 +428,9 @@ template <int N>
 void rates(const AlloyBlock& blk, const AlloyParameters& par, Scratch<N>& s) {
   primitives<N>(blk.psi, blk.c, par.k, s);
   if (par.rotated) {
-    phase_rate<N, true>(blk.psi, par, blk.dx, s);
+    phase_rate<N, true>(blk, par, s);
   } else {
-    phase_rate<N, false>(blk.psi, par, blk.dx, s);
+    phase_rate<N, false>(blk, par, s);
   }
   if (blk.noise > 0) add_noise<N>(blk, blk.psi, s);
 }

@@ -86,6 +86,7 @@ struct AlloyBlock {
   double* c_next = nullptr;
   std::array<const double*, DIM> velocity{};  ///< face velocities, or null: only the printed antitrapping reads them
   std::array<double*, FACES> face_flux{};     ///< where to leave the solute flux through a face, or null
+  std::array<const double*, 2> ahead{};        ///< what the next call reads (psi and c), or null: fetched meanwhile
   double dx = 1;
   double noise = 0;                ///< amplitude of the random rate of psi, 0: none
   std::uint64_t noise_key = 0;     ///< the same for all stages of a step

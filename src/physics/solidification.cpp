@@ -128,6 +128,7 @@ void Solidification::run_stage(const Stage& stage, double noise, std::uint64_t n
     const double begin = measure ? omp_get_wtime() : 0;
     AlloyBlock k = block_arrays(b);
     for (int f = 0; f < FACES; ++f) k.face_flux[static_cast<std::size_t>(f)] = fluxes_->store(b, f);
+    if (b + 1 < mesh_->size()) k.ahead = {mesh_->cells(psi_, b + 1), mesh_->cells(c_, b + 1)};
     k.noise = noise;
     k.noise_key = noise_key + static_cast<std::uint64_t>(mesh_->block(b).index.level);
     const BlockKind kind = classify(k.psi, layout.n);
