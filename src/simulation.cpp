@@ -14,8 +14,8 @@
 #include "io/plotfile.hpp"
 #include "output.hpp"
 #include "physics/alloy_kernel.hpp"
-#include "physics/flow.hpp"
 #include "physics/modules.hpp"
+#include "physics/motion.hpp"
 
 namespace dendrift {
 
@@ -72,7 +72,6 @@ Simulation::Simulation(Settings& settings, MPI_Comm comm, const std::optional<st
   ghosts_ = std::make_unique<amr::GhostExchange>(*mesh_);
   psi_ = field("psi");
   c_ = field("c");
-  if (settings.has_flow()) drift_ = physics::PrescribedFlow(settings.flow, settings.scales).velocity();
   for (const auto& m : modules_) m->attach(*mesh_, *ghosts_);
   if (checkpoint) {
     resume(*checkpoint);
@@ -127,9 +126,9 @@ void Simulation::resume(const std::string& file) {
   checkpoints_ = next_multiple(time_, settings_.output.checkpoint_every_s / settings_.scales.tau0_s) - 1;
   last_line_step_ = static_cast<std::int64_t>(take("last_line_step"));
   initial_solute_ = take("initial_solute");
-  const std::vector<double>& positions = list("crystal_positions");
-  for (std::size_t g = 0; g < crystals_.size(); ++g)
-    for (int a = 0; a < DIM; ++a) crystals_[g].position[a] = positions.at(g * DIM + at(a));
+  const std::vector<double>& positions = list("crystals");
+  const std::size_t each = positions.size() / std::max<std::size_t>(1, crystals_.size());
+  for (std::size_t g = 0; g < crystals_.size(); ++g) physics::recall(crystals_[g], std::span(positions).subspan(g * each, each));
   for (const auto& [name, values] : s.numbers)
     if (name.starts_with("tip.")) last_tips_[name.substr(4)] = values;
   for (const auto& m : modules_)
@@ -148,8 +147,10 @@ io::RunState Simulation::state() const {
   s.numbers["shape"] = shape_numbers(settings_, crystals_.size());
   s.numbers["last_line_step"] = {static_cast<double>(last_line_step_)};
   s.numbers["initial_solute"] = {initial_solute_};
-  for (const physics::Seed& g : crystals_)
-    s.numbers["crystal_positions"].insert(s.numbers["crystal_positions"].end(), g.position.begin(), g.position.end());
+  for (const physics::Seed& g : crystals_) {
+    const std::vector<double> memory = physics::memory(g);
+    s.numbers["crystals"].insert(s.numbers["crystals"].end(), memory.begin(), memory.end());
+  }
   for (const auto& m : modules_) s.numbers[std::string("module.") + m->name()] = m->memory();
   for (const auto& [name, values] : last_tips_) s.numbers["tip." + name] = values;
   return s;
@@ -186,8 +187,7 @@ double Simulation::max_dt() const {
 
 void Simulation::step(double dt) {
   for (const auto& m : modules_) clock_.time(m->name(), [&] { m->advance(time_, dt, step_); });
-  for (physics::Seed& g : crystals_)
-    for (int a = 0; a < DIM; ++a) g.position[a] += dt * drift_[a];
+  for (physics::Seed& g : crystals_) g.advance(dt);
   time_ += dt;
   ++step_;
   if (step_ < next_regrid_) return;
@@ -233,6 +233,7 @@ Outcome Simulation::run_to_end() {
           io::SharedFailure failure;  // one rank writes; all must learn that it could not
           failure.attempt(path("diagnostics.csv"), "write a line", [&] { write_line(t, dt); });
           write_tips(failure);
+          write_grains(failure);
           failure.agree(comm_);
           last_line_step_ = step_;
         }
@@ -357,8 +358,13 @@ void Simulation::open_output() {
           "max_speed_um_s,div_max_rel,flow_iterations,wall_s";
       const std::string tips = std::string("time_s,grain,arm,euler_deg,x_um,y_um,") + (DIM == 3 ? "z_um," : "") +
                                "speed_um_s,radius_um,off_axis_deg";
+      const std::string grains =
+          DIM == 2 ? "time_s,grain,x_um,y_um,vx_um_s,vy_um_s,omega_rad_s,angle_rad,area_um2,nonrigidity"
+                   : "time_s,grain,x_um,y_um,z_um,vx_um_s,vy_um_s,vz_um_s,omega_x_rad_s,omega_y_rad_s,omega_z_rad_s,"
+                     "q0,q1,q2,q3,volume_um3,nonrigidity";
       const double now = time_ * settings_.scales.tau0_s;
       if (resumed_) {
+        grains_csv_ = std::make_unique<io::CsvFile>(path("grains.csv"), grains, "time_s", now);
         diagnostics_csv_ = std::make_unique<io::CsvFile>(path("diagnostics.csv"), diagnostics, "time_s", now);
         tips_csv_ = std::make_unique<io::CsvFile>(path("tips.csv"), tips, "time_s", now);
       } else {
@@ -371,6 +377,7 @@ void Simulation::open_output() {
         }
         diagnostics_csv_ = std::make_unique<io::CsvFile>(path("diagnostics.csv"), diagnostics);
         tips_csv_ = std::make_unique<io::CsvFile>(path("tips.csv"), tips);
+        grains_csv_ = std::make_unique<io::CsvFile>(path("grains.csv"), grains);
       }
     });
   failure.agree(comm_);
@@ -380,12 +387,13 @@ void Simulation::open_output() {
 void Simulation::write_line(const Totals& t, double dt) {
   if (mesh_->rank() != 0) return;
   const physics::Scales& s = settings_.scales;
-  double speed = 0;
-  for (const double v : drift_) speed += v * v;
+  physics::Report r;
+  for (const auto& m : modules_) m->report(r);
   diagnostics_csv_->line({static_cast<double>(step_), time_ * s.tau0_s, time_, dt, static_cast<double>(t.blocks),
                           static_cast<double>(t.blocks * volume(filled(mesh_->layout().n))),
                           static_cast<double>(t.levels), t.solid_fraction, t.solute_mean * s.c_l_wt, solute_drift(t),
-                          s.speed_um_s(std::sqrt(speed)), 0, 0, MPI_Wtime() - wall_start_});
+                          s.speed_um_s(r.max_speed), r.divergence_max, static_cast<double>(r.flow_iterations),
+                          MPI_Wtime() - wall_start_});
 }
 
 void Simulation::write_tips(io::SharedFailure& failure) {
@@ -406,6 +414,31 @@ void Simulation::write_tips(io::SharedFailure& failure) {
     line.push_back(t.radius * s.w0_um);
     line.push_back(t.off_axis_deg);
     failure.attempt(path("tips.csv"), "write a line", [&] { tips_csv_->line(line); });
+  }
+}
+
+void Simulation::write_grains(io::SharedFailure& failure) {
+  const physics::Scales& s = settings_.scales;
+  const auto velocity = mesh_->fields().find("velocity_x");
+  // Without a flow the motion is known, but volumes are not.
+  if (!settings_.has_flow() || settings_.flow.prescribed()) {
+    std::vector<physics::Seed> measured = crystals_;
+    physics::measure_motion(*mesh_, psi_, {velocity.value_or(-1)}, measured);
+    for (std::size_t g = 0; g < crystals_.size(); ++g) crystals_[g].volume = measured[g].volume;
+  }
+  if (mesh_->rank() != 0) return;
+  for (std::size_t g = 0; g < crystals_.size(); ++g) {
+    const physics::Seed& c = crystals_[g];
+    std::vector<double> line{time_ * s.tau0_s, static_cast<double>(g)};
+    for (const double x : c.position) line.push_back(x * s.w0_um);
+    for (const double v : c.velocity) line.push_back(s.speed_um_s(v));
+    for (std::size_t a = DIM == 2 ? 2 : 0; a < 3; ++a) line.push_back(c.spin[a] / s.tau0_s);
+    if (DIM == 2) line.push_back(c.angle);
+    if (DIM == 3)
+      for (const double q : physics::quaternion(c)) line.push_back(q);
+    line.push_back(c.volume * std::pow(s.w0_um, DIM));
+    line.push_back(c.nonrigidity);
+    failure.attempt(path("grains.csv"), "write a line", [&] { grains_csv_->line(line); });
   }
 }
 
@@ -431,11 +464,27 @@ void Simulation::write_plotfile() {
       {"c", of_state([&s](int, double, double c) { return c * s.c_l_wt; })},
       {"alpha", of_state([angle](int, double, double) { return angle; })},
   };
+  const auto zero = of_state([](int, double, double) { return 0.0; });
+  const auto velocity = mesh_->fields().find("velocity_x"), pressure = mesh_->fields().find("pressure");
   for (int a = 0; a < DIM; ++a) {
-    const double v = s.speed_um_s(drift_[a]);
-    fields.push_back({std::string("velocity_") + "xyz"[a], of_state([v](int, double, double) { return v; })});
+    const auto at_centres = [this, &layout, &s, velocity, a](int b, std::span<double> out) {
+      const double* v = mesh_->faces({*velocity}, a, b);
+      std::size_t i = 0;
+      amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
+        const std::ptrdiff_t q = layout.offset(cell);
+        out[i++] = s.speed_um_s(0.5 * (v[q] + v[q + layout.stride(a)]));
+      });
+    };
+    fields.push_back({std::string("velocity_") + "xyz"[a], zero});
+    if (velocity) fields.back().values = at_centres;
   }
-  fields.push_back({"pressure", of_state([](int, double, double) { return 0.0; })});
+  fields.push_back({"pressure", zero});
+  if (pressure)
+    fields.back().values = [this, &layout, pressure](int b, std::span<double> out) {
+      const double* p = mesh_->cells({*pressure}, b);
+      std::size_t i = 0;
+      amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) { out[i++] = p[layout.offset(cell)]; });
+    };
   fields.push_back({"level", of_state([this](int b, double, double) { return double(mesh_->block(b).index.level); })});
   fields.push_back({"rank", of_state([this](int, double, double) { return double(mesh_->rank()); })});
   fields.push_back({"grain", of_state([](int, double phi, double) { return phi > 0 ? 0.0 : -1.0; })});

@@ -19,10 +19,7 @@
 
 namespace dendrift {
 
-/// The state has lost its meaning: not finite, or out of bounds.
-class NumericalError : public std::runtime_error {
-  using std::runtime_error::runtime_error;
-};
+using physics::NumericalError;
 
 /// Wall time by phase of the step, seconds of this rank.
 class PhaseClock {
@@ -95,6 +92,7 @@ class Simulation {
   void open_output();
   void write_line(const Totals& t, double dt);
   void write_tips(io::SharedFailure& failure);
+  void write_grains(io::SharedFailure& failure);
   void write_plotfile();
   void save();
   void write_manifest(const std::string& status);
@@ -108,7 +106,6 @@ class Simulation {
   std::unique_ptr<amr::Mesh> mesh_;
   std::unique_ptr<amr::GhostExchange> ghosts_;
   std::vector<physics::Seed> crystals_;
-  RealVec drift_{};  // velocity that carries the crystals
   amr::CellField psi_, c_;
   double time_ = 0;  // tau0
   std::int64_t step_ = 0;
@@ -118,7 +115,7 @@ class Simulation {
   std::map<std::string, std::vector<double>> last_tips_;  // "grain.arm" -> time, length
   std::int64_t last_line_step_ = -1;
   bool resumed_ = false;
-  std::unique_ptr<io::CsvFile> diagnostics_csv_, tips_csv_;
+  std::unique_ptr<io::CsvFile> diagnostics_csv_, tips_csv_, grains_csv_;
   std::vector<std::string> saved_;
   PhaseClock clock_;
   double wall_start_ = 0, last_progress_ = 0;

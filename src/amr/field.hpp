@@ -33,6 +33,7 @@ struct FieldSpec {
   std::string unit;    ///< of the stored numbers
   std::string doc;
   Centring centring = Centring::cell;
+  int normal = -1;       ///< of the faces, where they carry the field
   Transfer transfer = Transfer::none;
   bool checkpoint = false;
   std::array<SideRule, FACES> sides{};
@@ -59,6 +60,7 @@ class FieldTable {
     for (int a = 0; a < DIM; ++a) {
       FieldSpec component = spec;
       component.centring = Centring::face;
+      component.normal = a;
       component.name += std::string("_") + "xyz"[a];
       const int id = append(std::move(component));
       if (a == 0) f.id = id;
@@ -73,12 +75,25 @@ class FieldTable {
   int size() const { return static_cast<int>(rows_.size()); }
   const FieldSpec& row(int id) const { return rows_[static_cast<std::size_t>(id)]; }
 
-  /// Cell fields that live through a change of the mesh.
-  std::vector<CellField> transferred() const {
-    std::vector<CellField> out;
+  /// Arrays that live through a change of the mesh.
+  std::vector<int> transferred() const {
+    std::vector<int> out;
     for (int i = 0; i < size(); ++i)
-      if (row(i).transfer != Transfer::none) out.push_back({i});
+      if (row(i).transfer != Transfer::none) out.push_back(i);
     return out;
+  }
+  /// The cell-centred ones among them.
+  std::vector<CellField> transferred_cells() const {
+    std::vector<CellField> out;
+    for (const int i : transferred())
+      if (row(i).centring == Centring::cell) out.push_back({i});
+    return out;
+  }
+  /// Values of a row that a block of n cells a side keeps: its cells, or its faces on both sides.
+  IntVec extent(int id, int n) const {
+    IntVec e = filled(n);
+    if (row(id).normal >= 0) ++e[row(id).normal];
+    return e;
   }
 
  private:

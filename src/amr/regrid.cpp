@@ -4,6 +4,7 @@
 #include <map>
 
 #include "amr/comm.hpp"
+#include "amr/face_transfer.hpp"
 
 namespace dendrift::amr {
 
@@ -86,7 +87,23 @@ class Rebuilder {
  private:
   bool ours(int leaf) const { return mesh_.owner(leaf) == mesh_.rank(); }
   int slot_of(int old_leaf) const { return mesh_.block(mesh_.local(old_leaf)).slot; }
-  ArrayRef<double> ref(CellField f, int slot) { return array_ref(mesh_.array(f.id, slot), mesh_.layout()); }
+  ArrayRef<double> ref(int field, int slot) { return array_ref(mesh_.array(field, slot), mesh_.layout()); }
+  int normal(int field) const { return mesh_.fields().row(field).normal; }
+  IntVec half_extent(int field) const { return mesh_.fields().extent(field, mesh_.layout().n / 2); }
+  std::ptrdiff_t half_values() const {
+    std::ptrdiff_t sum = 0;
+    for (const int f : fields_) sum += volume(half_extent(f));
+    return sum;
+  }
+  void restrict_field(int field, ArrayRef<double> dst, const IntVec& lo, int slot) {
+    const ArrayRef<double> s = ref(field, slot);
+    const IntVec half = filled(mesh_.layout().n / 2);
+    if (normal(field) < 0) {
+      restrict_box(dst, lo, {s.p, s.stride}, {}, half);
+    } else {
+      restrict_faces(dst, lo, {s.p, s.stride}, half, normal(field));
+    }
+  }
 
   void keep(int i, int j) {
     if (ours(j)) slots_[at(i)] = slot_of(j);
@@ -101,16 +118,24 @@ class Rebuilder {
     const IntVec place = child_place(next_.leaf(i));
     IntVec corner{};
     for (int a = 0; a < DIM; ++a) corner[a] = place[a] * n / 2;
-    for (const CellField f : fields_) {
+    for (const int f : fields_) {
       const ArrayRef<double> p = ref(f, parent);
-      prolong_box(ref(f, slot), {}, {p.at(corner), p.stride}, filled(n));
+      if (normal(f) < 0) prolong_box(ref(f, slot), {}, {p.at(corner), p.stride}, filled(n));
+      if (normal(f) != 0) continue;
+      Array<ArrayRef<double>> fine{};
+      Array<ArrayRef<const double>> coarse{};
+      for (int a = 0; a < DIM; ++a) {
+        const ArrayRef<double> q = ref(f + a, parent);
+        fine[a] = ref(f + a, slot);
+        coarse[a] = {q.at(corner), q.stride};
+      }
+      prolong_faces(fine, coarse, n);
     }
     if (is_origin(place)) retired_.push_back(parent);
   }
 
   void coarsen(int i, int first) {
     const int n = mesh_.layout().n;
-    const IntVec half = filled(n / 2);
     const int owner = owners_[at(i)];
     if (owner == mesh_.rank()) slots_[at(i)] = mesh_.acquire_slot();
     for (int m = 0; m < CHILDREN; ++m) {
@@ -118,17 +143,13 @@ class Rebuilder {
       IntVec corner = child_place(mesh_.tree().leaf(j));
       for (int& c : corner) c *= n / 2;
       if (ours(j) && owner == mesh_.rank()) {
-        for (const CellField f : fields_) {
-          const ArrayRef<double> s = ref(f, slot_of(j));
-          restrict_box(ref(f, slots_[at(i)]), corner, {s.p, s.stride}, {}, half);
-        }
+        for (const int f : fields_) restrict_field(f, ref(f, slots_[at(i)]), corner, slot_of(j));
       } else if (ours(j)) {
         std::vector<double>& buffer = sends_[owner];
-        for (const CellField f : fields_) {
+        for (const int f : fields_) {
           const std::size_t before = buffer.size();
-          buffer.resize(before + at(static_cast<int>(volume(half))));
-          const ArrayRef<double> s = ref(f, slot_of(j));
-          restrict_box(packed_ref(buffer.data() + before, half), {}, {s.p, s.stride}, {}, half);
+          buffer.resize(before + static_cast<std::size_t>(volume(half_extent(f))));
+          restrict_field(f, packed_ref(buffer.data() + before, half_extent(f)), {}, slot_of(j));
         }
       } else if (owner == mesh_.rank()) {
         expected_[mesh_.owner(j)].push_back({slots_[at(i)], corner});
@@ -138,8 +159,7 @@ class Rebuilder {
   }
 
   void finish_messages() {
-    const IntVec half = filled(mesh_.layout().n / 2);
-    const std::size_t each = static_cast<std::size_t>(volume(half)) * fields_.size();
+    const auto each = static_cast<std::size_t>(half_values());
     std::map<int, std::vector<double>> received;
     std::vector<MPI_Request> requests;
     for (auto& [rank, list] : expected_) {
@@ -155,7 +175,8 @@ class Rebuilder {
     for (auto& [rank, list] : expected_) {
       const double* p = received[rank].data();
       for (const auto& [slot, corner] : list) {
-        for (const CellField f : fields_) {
+        for (const int f : fields_) {
+          const IntVec half = half_extent(f);
           copy_box(ref(f, slot), corner, packed_ref(p, half), {}, half);
           p += volume(half);
         }
@@ -165,7 +186,7 @@ class Rebuilder {
 
   Mesh& mesh_;
   const Tree& next_;
-  std::vector<CellField> fields_;
+  std::vector<int> fields_;
   std::vector<int> owners_, slots_;
   std::vector<int> retired_;
   std::map<int, std::vector<double>> sends_;
@@ -189,9 +210,10 @@ Proposal propose(const Mesh& mesh, std::span<const Tag> tags) {
 }
 
 void migrate(Mesh& mesh, const std::vector<int>& owners) {
-  const std::vector<CellField> fields = mesh.fields().transferred();
-  const IntVec n = filled(mesh.layout().n);
-  const std::size_t each = static_cast<std::size_t>(volume(n)) * fields.size();
+  const std::vector<int> fields = mesh.fields().transferred();
+  const auto extent = [&](int field) { return mesh.fields().extent(field, mesh.layout().n); };
+  std::size_t each = 0;
+  for (const int f : fields) each += static_cast<std::size_t>(volume(extent(f)));
   const int me = mesh.rank();
   std::map<int, std::vector<double>> sends, receives;
   std::vector<int> slots(owners.size(), -1), retired;
@@ -202,10 +224,11 @@ void migrate(Mesh& mesh, const std::vector<int>& owners) {
     if (from == me) {
       std::vector<double>& buffer = sends[to];
       const int slot = mesh.block(mesh.local(i)).slot;
-      for (const CellField f : fields) {
+      for (const int f : fields) {
         const std::size_t before = buffer.size();
+        const IntVec n = extent(f);
         buffer.resize(before + static_cast<std::size_t>(volume(n)));
-        const ArrayRef<double> s = array_ref(mesh.array(f.id, slot), mesh.layout());
+        const ArrayRef<double> s = array_ref(mesh.array(f, slot), mesh.layout());
         copy_box(packed_ref(buffer.data() + before, n), {}, {s.p, s.stride}, {}, n);
       }
       retired.push_back(slot);
@@ -228,9 +251,10 @@ void migrate(Mesh& mesh, const std::vector<int>& owners) {
     const int from = mesh.owner(i);
     if (from == me || owners[at(i)] != me) continue;
     slots[at(i)] = mesh.acquire_slot();
-    for (const CellField f : fields) {
+    for (const int f : fields) {
       const double* p = receives[from].data() + read[from];
-      copy_box(array_ref(mesh.array(f.id, slots[at(i)]), mesh.layout()), {}, packed_ref(p, n), {}, n);
+      const IntVec n = extent(f);
+      copy_box(array_ref(mesh.array(f, slots[at(i)]), mesh.layout()), {}, packed_ref(p, n), {}, n);
       read[from] += static_cast<std::size_t>(volume(n));
     }
   }
@@ -239,7 +263,7 @@ void migrate(Mesh& mesh, const std::vector<int>& owners) {
 
 bool regrid(Mesh& mesh, GhostExchange& ghosts, const Proposal& proposal, const RegridOptions& options) {
   if (proposal.changed) {
-    ghosts.fill(mesh.fields().transferred());  // prolongation looks one cell beyond the block
+    ghosts.fill(mesh.fields().transferred_cells());  // prolongation looks one cell beyond the block
     Rebuilder(mesh, proposal.tree).run();
   }
   if (mesh.ranks() > 1 && imbalance(proposal.weights, mesh.owners(), mesh.ranks()) > options.max_imbalance) {

@@ -41,10 +41,14 @@ void write_list(const Group& file, const std::string& name, const std::vector<T>
 // Everything but the values of the fields; one rank alone.
 void create_file(const std::string& path, const amr::Mesh& mesh, const RunState& state) {
   File file = File::create(path);
-  const auto cells = static_cast<hsize_t>(volume(filled(mesh.layout().n)) * mesh.tree().size());
+  const auto length = [&](int id) {
+    return static_cast<hsize_t>(volume(mesh.fields().extent(id, mesh.layout().n)) * mesh.tree().size());
+  };
   const std::vector<int> fields_kept = checkpointed(mesh.fields());
+  hsize_t all_values = 0;
+  for (const int id : fields_kept) all_values += length(id);
   // A full disk must show here, where one rank alone can still give up.
-  reserve_space(path, (1 << 20) + fields_kept.size() * cells * sizeof(double) + mesh.owners().size() * 16);
+  reserve_space(path, (1 << 20) + all_values * sizeof(double) + mesh.owners().size() * 16);
   file.write_attribute("format", std::int32_t{CHECKPOINT_FORMAT});
   file.write_attribute("dim", std::int32_t{DIM});
   file.write_attribute("block_cells", std::int32_t{mesh.layout().n});
@@ -64,7 +68,7 @@ void create_file(const std::string& path, const amr::Mesh& mesh, const RunState&
     const Group fields = file.create_group("fields");
     for (const int id : fields_kept)
       static_cast<void>(
-          fields.create_dataset(mesh.fields().row(id).name, Type::of<double>(), Dataspace::simple(cells)));
+          fields.create_dataset(mesh.fields().row(id).name, Type::of<double>(), Dataspace::simple(length(id))));
   }
   file.close();
 }
@@ -74,8 +78,8 @@ void write_fields(const std::string& path, const amr::Mesh& mesh, SharedFailure&
   {
     const Group fields = file.open_group("fields");
     const Share share = share_of(mesh.owners(), mesh.comm());
-    const IntVec n = filled(mesh.layout().n);
     for (const int id : checkpointed(mesh.fields())) {
+      const IntVec n = mesh.fields().extent(id, mesh.layout().n);
       const Dataset d = fields.open_dataset(mesh.fields().row(id).name);
       write_items<double>(d, share, static_cast<std::size_t>(volume(n)), failure,
                           [&](std::size_t leaf, std::span<double> out) {
@@ -163,10 +167,10 @@ std::vector<amr::BlockIndex> read_leaves(const std::string& path, MPI_Comm comm)
 void read_fields(const std::string& path, amr::Mesh& mesh) {
   const File file = File::open(path, Access::read, mesh.comm());
   const Group fields = file.open_group("fields");
-  const IntVec n = filled(mesh.layout().n);
-  const auto length = static_cast<std::size_t>(volume(n));
-  std::vector<double> values(length);
   for (const int id : checkpointed(mesh.fields())) {
+    const IntVec n = mesh.fields().extent(id, mesh.layout().n);
+    const auto length = static_cast<std::size_t>(volume(n));
+    std::vector<double> values(length);
     const Dataset d = fields.open_dataset(mesh.fields().row(id).name);
     for (const amr::Block& b : mesh.blocks()) {
       Dataspace where = Dataspace::simple(length * static_cast<std::size_t>(mesh.tree().size()));

@@ -1,37 +1,106 @@
 /// \file
-/// The velocity of the melt and of the crystals in it: table [flow]. So far the velocity is prescribed.
+/// The velocity of the melt and of the crystals in it: table [flow]; eqs. (5) and (6).
 #pragma once
 
+#include <memory>
 #include <optional>
 
 #include "io/config.hpp"
 #include "physics/module.hpp"
 #include "physics/scales.hpp"
+#include "physics/seeds.hpp"
+#include "physics/stokes.hpp"
 
 namespace dendrift::physics {
 
+/// How the viscosity goes from melt to solid, f = (1+phi)/2. h1, h2, h3: 1/nu = s/nu_s + (1-s)/nu_l with
+/// s = f^n/(f^n + (1-f)^n): a solid of the size of phi = 0. linear: as printed; the solid then reaches far into the melt.
+enum class ViscosityLaw : std::uint8_t { h1, h2, h3, linear };
+
+/// Which excess of solute makes the melt heavy: what phi and c together hold (the print), or what the liquid
+/// of the same U holds, which has no dip inside the interface.
+enum class Buoyancy : std::uint8_t { mixture, liquid };
+
 struct FlowOptions {
   std::optional<RealVec> velocity_um_s, velocity_w0_tau0;
+  double viscosity_um2_s = 5e5;
+  double viscosity_ratio = 1e6;
+  ViscosityLaw viscosity = ViscosityLaw::h3;
+  Stress stress = Stress::symmetric;
+  double gravity_um_s2 = 1e7;
+  double solutal_expansion_per_wt = 9.2e-3;
+  double solid_density_ratio = 2.7 / 2.45;
+  bool solutal_buoyancy = true, solid_weight = true, inertia = true;
+  Buoyancy buoyancy = Buoyancy::mixture;
+  double tolerance = 1e-5;
+  int max_iterations = 300;
+  double courant = 0.5, max_interval_tau0 = 4, max_change = 0.05;
+  std::array<std::optional<RealVec>, 6> wall_velocity_w0_tau0;  ///< those of z are read in 3D only
 
   void declare(io::Schema& schema);
+  bool prescribed() const { return velocity_um_s || velocity_w0_tau0; }
 };
 
-/// Provides the face field "velocity" (W0/tau0), so far uniform.
+/// nu/nu_l for a given phi.
+double relative_viscosity(ViscosityLaw law, double ratio, double phi);
+
+/// Provides the face field "velocity" (W0/tau0), uniform and constant.
 class PrescribedFlow : public Module {
  public:
-  PrescribedFlow(const FlowOptions& options, const Scales& scales);
+  PrescribedFlow(const FlowOptions& options, const Scales& scales, std::vector<Seed>& crystals);
   const char* name() const override { return "flow"; }
   void declare(amr::FieldTable& fields) override;
   void attach(amr::Mesh& mesh, amr::GhostExchange&) override { mesh_ = &mesh; }
   void initialize() override { after_regrid(); }
   void after_regrid() override;
-
-  const RealVec& velocity() const { return velocity_; }
+  void report(Report& r) const override;
 
  private:
   RealVec velocity_{};
   amr::FaceField v_;
   amr::Mesh* mesh_ = nullptr;
+};
+
+/// Provides "velocity" (W0/tau0) and "pressure" (of unit density, W0^2/tau0^2), and moves the crystals.
+///
+/// Backward Euler from one solution to the next, explicit for v.grad v. The flow is solved once in several steps of
+/// growth: at the latest when the melt has moved by `courant` cells, when the velocity is expected to have changed by
+/// `max_change`, and after every change of the mesh.
+class Flow : public Module {
+ public:
+  Flow(const FlowOptions& options, const Scales& scales, std::vector<Seed>& crystals);
+  const char* name() const override { return "flow"; }
+  void declare(amr::FieldTable& fields) override;
+  void attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) override;
+  void after_regrid() override;
+  void advance(double t, double dt, std::int64_t step) override;
+  void report(Report& r) const override;
+  std::vector<double> memory() const override;
+  void recall(const std::vector<double>& m) override;
+
+ private:
+  void solve(double elapsed);
+  void load();
+  void store();
+  void set_viscosity();
+  void set_force(double sigma);
+  void add_inertia(int b);
+
+  FlowOptions options_;
+  Scales scales_;
+  std::vector<Seed>& crystals_;
+  double viscosity_, solutal_, weight_;  // nu_l; alpha_c c_l and rho_s/rho_l - 1, times the switches
+  RealVec gravity_{};  // W0/tau0^2
+  amr::CellField psi_, c_, pressure_;
+  amr::FaceField v_;
+  amr::Mesh* mesh_ = nullptr;
+  amr::GhostExchange* ghosts_ = nullptr;
+  std::unique_ptr<StokesSolver> solver_;
+  std::vector<double> before_;  // velocity before a solution, to see how fast it changes
+  double last_ = 0, next_ = 0, interval_ = 0;
+  double fastest_ = 0;
+  bool due_ = false, recalled_ = false;
+  StokesResult result_;
 };
 
 }  // namespace dendrift::physics

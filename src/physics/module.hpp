@@ -4,6 +4,7 @@
 #pragma once
 
 #include <memory>
+#include <stdexcept>
 #include <vector>
 
 #include "amr/ghost.hpp"
@@ -11,6 +12,18 @@
 #include "amr/regrid.hpp"
 
 namespace dendrift::physics {
+
+/// The state has lost its meaning: not finite, out of bounds, or a solver that does not converge.
+class NumericalError : public std::runtime_error {
+  using std::runtime_error::runtime_error;
+};
+
+/// What modules have to say for a line of diagnostics.csv.
+struct Report {
+  double max_speed = 0;       ///< W0/tau0
+  double divergence_max = 0;  ///< largest |div v| dx over the largest |v|
+  int flow_iterations = 0;
+};
 
 /// The defaults do nothing. Times in tau0, lengths in W0.
 class Module {
@@ -39,6 +52,7 @@ class Module {
   virtual void tag(int /*b*/, amr::Tag&) const {}
   /// Speed at which what tag() looks at travels through the mesh. Ghosts are filled. Collective; the same on all ranks.
   virtual double front_speed() { return 0; }
+  virtual void report(Report&) const {}
   /// What a restart must know beside the fields, and giving it back.
   virtual std::vector<double> memory() const { return {}; }
   virtual void recall(const std::vector<double>&) {}

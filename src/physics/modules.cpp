@@ -7,9 +7,10 @@
 
 namespace dendrift::physics {
 
-Modules make_modules(const Settings& s, const std::vector<Seed>& seeds) {
+Modules make_modules(const Settings& s, std::vector<Seed>& seeds) {
   Modules m;
-  if (s.has_flow()) m.push_back(std::make_unique<PrescribedFlow>(s.flow, s.scales));
+  if (s.has_flow() && s.flow.prescribed()) m.push_back(std::make_unique<PrescribedFlow>(s.flow, s.scales, seeds));
+  if (s.has_flow() && !s.flow.prescribed()) m.push_back(std::make_unique<Flow>(s.flow, s.scales, seeds));
   if (s.has_flow()) m.push_back(std::make_unique<Transport>(s.scales.k));
   m.push_back(std::make_unique<Solidification>(s.phase_field, s.solute, s.scales, seeds));
   return m;

@@ -12,6 +12,6 @@ class Settings;
 namespace dendrift::physics {
 
 /// The modules that the input asks for.
-Modules make_modules(const Settings& settings, const std::vector<Seed>& seeds);
+Modules make_modules(const Settings& settings, std::vector<Seed>& seeds);
 
 }  // namespace dendrift::physics

@@ -1,7 +1,9 @@
 #include "physics/seeds.hpp"
 
+#include <algorithm>
 #include <cmath>
 #include <numbers>
+#include <stdexcept>
 
 namespace dendrift::physics {
 
@@ -88,9 +90,90 @@ std::vector<Seed> make_seeds(const std::vector<SeedOptions>& options, const Scal
         if (s.axes[i][a] != (i == a ? 1.0 : 0.0)) s.rotated = true;
       }
     }
+    s.angle = std::atan2(s.axes[0][1], s.axes[0][0]);
     seeds.push_back(s);
   }
   return seeds;
+}
+
+void Seed::advance(double dt) {
+  for (int a = 0; a < DIM; ++a) position[a] += dt * velocity[a];
+  const double rate = std::hypot(spin[0], spin[1], spin[2]);
+  if (rate * dt == 0) return;
+  angle += dt * spin[2];
+  // Rodrigues: x cos + (n cross x) sin + n (n.x) (1 - cos)
+  const double cosine = std::cos(rate * dt), sine = std::sin(rate * dt);
+  for (RealVec& axis : axes) {
+    std::array<double, 3> x{};
+    std::copy(axis.begin(), axis.end(), x.begin());
+    double along = 0;
+    for (std::size_t a = 0; a < 3; ++a) along += spin[a] / rate * x[a];
+    for (std::size_t a = 0; a < DIM; ++a) {
+      const std::size_t b = (a + 1) % 3, c = (a + 2) % 3;
+      const double cross = (spin[b] * x[c] - spin[c] * x[b]) / rate;
+      axis[a] = x[a] * cosine + cross * sine + spin[a] / rate * along * (1 - cosine);
+    }
+  }
+  // Gram-Schmidt, so that round-off does not grow over a million steps.
+  for (std::size_t i = 0; i < axes.size(); ++i) {
+    for (std::size_t j = 0; j < i; ++j) {
+      double overlap = 0;
+      for (std::size_t a = 0; a < DIM; ++a) overlap += axes[i][a] * axes[j][a];
+      for (std::size_t a = 0; a < DIM; ++a) axes[i][a] -= overlap * axes[j][a];
+    }
+    double square = 0;
+    for (const double x : axes[i]) square += x * x;
+    for (double& x : axes[i]) x /= std::sqrt(square);
+  }
+  rotated = true;
+}
+
+std::array<double, 4> quaternion(const Seed& crystal) {
+  // Columns of the rotation matrix are the crystal's axes. Shepperd's method: divide by the largest component.
+  Matrix3 m{};
+  for (std::size_t i = 0; i < 3; ++i)
+    for (std::size_t a = 0; a < 3; ++a)
+      m[a][i] = i < DIM && a < DIM ? crystal.axes[i % DIM][a % DIM] : (i == a ? 1.0 : 0.0);
+  const double trace = m[0][0] + m[1][1] + m[2][2];
+  const std::array<double, 4> squares{1 + trace, 1 + 2 * m[0][0] - trace, 1 + 2 * m[1][1] - trace, 1 + 2 * m[2][2] - trace};
+  const std::array<std::array<double, 4>, 4> products{{
+      {squares[0], m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]},
+      {m[2][1] - m[1][2], squares[1], m[1][0] + m[0][1], m[0][2] + m[2][0]},
+      {m[0][2] - m[2][0], m[1][0] + m[0][1], squares[2], m[2][1] + m[1][2]},
+      {m[1][0] - m[0][1], m[0][2] + m[2][0], m[2][1] + m[1][2], squares[3]},
+  }};
+  const auto largest = static_cast<std::size_t>(std::max_element(squares.begin(), squares.end()) - squares.begin());
+  std::array<double, 4> q = products[largest];
+  double norm = 0;
+  for (const double x : q) norm += x * x;
+  const double scale = (q[0] < 0 ? -1.0 : 1.0) / std::sqrt(norm);
+  for (double& x : q) x *= scale;
+  return q;
+}
+
+std::vector<double> memory(const Seed& c) {
+  std::vector<double> m(c.position.begin(), c.position.end());
+  m.insert(m.end(), c.velocity.begin(), c.velocity.end());
+  m.insert(m.end(), c.spin.begin(), c.spin.end());
+  for (const RealVec& axis : c.axes) m.insert(m.end(), axis.begin(), axis.end());
+  m.insert(m.end(), {c.rotated ? 1.0 : 0.0, c.angle, c.volume, c.nonrigidity});
+  return m;
+}
+
+void recall(Seed& c, std::span<const double> m) {
+  if (m.size() != memory(c).size()) throw std::out_of_range("crystal: a list of another length");
+  auto next = m.begin();
+  const auto take = [&](auto& list) {
+    for (double& x : list) x = *next++;
+  };
+  take(c.position);
+  take(c.velocity);
+  take(c.spin);
+  for (RealVec& axis : c.axes) take(axis);
+  c.rotated = *next++ != 0;
+  c.angle = *next++;
+  c.volume = *next++;
+  c.nonrigidity = *next++;
 }
 
 }  // namespace dendrift::physics

@@ -2,7 +2,9 @@
 /// The crystals at the start: table [[seed]].
 #pragma once
 
+#include <array>
 #include <optional>
+#include <span>
 #include <vector>
 
 #include "amr/dim.hpp"
@@ -21,12 +23,28 @@ struct SeedOptions {
   static void declare(io::Schema& schema, std::vector<SeedOptions>& seeds);
 };
 
+/// A crystal: as it starts, and how it moves.
 struct Seed {
-  RealVec position{};     ///< W0
-  double radius = 0;      ///< W0
+  RealVec position{};     ///< of the point where it started, which moves with it, W0
+  double radius = 0;      ///< at the start, W0
   Array<RealVec> axes{};  ///< row i: crystal axis i in the frame of the mesh
-  bool rotated = false;
+  bool rotated = false;   ///< axes are not those of the mesh
+  RealVec velocity{};     ///< of that point, W0/tau0
+  std::array<double, 3> spin{};  ///< rad/tau0; 2D: the last one
+  double angle = 0;       ///< 2D: of axis 0, unwrapped, rad
+  double volume = 0;      ///< 2D: area; measured with the motion
+  double nonrigidity = 0; ///< rms deviation of the solid's velocity from rigid motion, over its rms velocity
+
+  /// Moves and turns for a time dt.
+  void advance(double dt);
 };
+
+/// Unit quaternion (real part first, >= 0) that turns the axes of the mesh into those of the crystal.
+std::array<double, 4> quaternion(const Seed& crystal);
+
+/// What a restart must know of a crystal, and giving it back. Throws std::out_of_range if the list is too short.
+std::vector<double> memory(const Seed& crystal);
+void recall(Seed& crystal, std::span<const double> memory);
 
 std::vector<Seed> make_seeds(const std::vector<SeedOptions>& options, const Scales& scales);
 

@@ -14,15 +14,19 @@ constexpr int MAX_STAGES = 40;
 }
 
 Solidification::Solidification(const PhaseFieldOptions& phase, const SoluteOptions& solute, const Scales& scales,
-                               std::vector<Seed> seeds)
-    : phase_(phase), solute_(solute), scales_(scales), seeds_(std::move(seeds)) {
+                               const std::vector<Seed>& crystals)
+    : phase_(phase), solute_(solute), scales_(scales), crystals_(crystals) {
   parameters_.k = scales.k;
   parameters_.lambda = scales.lambda;
   parameters_.diffusivity = scales.diffusivity;
   parameters_.epsilon = phase.anisotropy;
   parameters_.antitrapping = solute.antitrapping;
-  parameters_.axes = seeds_.front().axes;
-  parameters_.rotated = seeds_.front().rotated;
+  turn_axes();
+}
+
+void Solidification::turn_axes() {
+  parameters_.axes = crystals_.front().axes;
+  parameters_.rotated = crystals_.front().rotated;
 }
 
 void Solidification::declare(amr::FieldTable& fields) {
@@ -45,7 +49,7 @@ void Solidification::attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) {
 
 void Solidification::initialize() {
   amr::parallel_for(mesh_->size(), [&](int b) {
-    set_seeds(*mesh_, psi_, seeds_, b);
+    set_seeds(*mesh_, psi_, crystals_, b);
     set_uniform_supersaturation(*mesh_, psi_, c_, scales_, b);
   });
 }
@@ -143,6 +147,7 @@ void Solidification::run_stage(const Stage& stage, double noise, std::uint64_t n
 
 void Solidification::advance(double, double dt, std::int64_t step) {
   if (phase_.frozen) return;
+  turn_axes();
   const double dx = mesh_->shape().dx(mesh_->shape().max_level);
   const int s = stages(dt);
   const double w = 2.0 / (s * s + s) * dt;
@@ -173,7 +178,7 @@ void Solidification::before_tagging() {
 void Solidification::tag(int b, amr::Tag& tag) const {
   tag_interface(*mesh_, psi_, phase_, b, tag);
   tag_solute(*mesh_, psi_, c_, scales_, solute_, b, tag);
-  if (initializing_) tag_seeds(*mesh_, seeds_, phase_.band(), b, tag);
+  if (initializing_) tag_seeds(*mesh_, crystals_, phase_.band(), b, tag);
   tag.weight = kind_cost_[static_cast<std::size_t>(classify(mesh_->cells(psi_, b), mesh_->layout().n))];
 }
 

@@ -18,7 +18,7 @@ namespace dendrift::physics {
 class Solidification : public Module {
  public:
   Solidification(const PhaseFieldOptions& phase, const SoluteOptions& solute, const Scales& scales,
-                 std::vector<Seed> seeds);
+                 const std::vector<Seed>& crystals);
 
   const char* name() const override { return "solidification"; }
   void declare(amr::FieldTable& fields) override;
@@ -44,13 +44,14 @@ class Solidification : public Module {
   const AlloyParameters& parameters() const { return parameters_; }
 
  private:
+  void turn_axes();
   AlloyBlock block_arrays(int b) const;
   void run_stage(const Stage& stage, double noise, std::uint64_t noise_key, bool measure);
 
   PhaseFieldOptions phase_;
   SoluteOptions solute_;
   Scales scales_;
-  std::vector<Seed> seeds_;
+  const std::vector<Seed>& crystals_;
   AlloyParameters parameters_;
   amr::CellField psi_, c_, psi_other_, c_other_;
   amr::FaceField velocity_;  // id -1: no flow

@@ -56,7 +56,7 @@ void Transport::attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) {
   v_.id = f.find("velocity_x").value();
 }
 
-void Transport::after_regrid() {
+void Transport::measure() {
   const amr::Layout& layout = mesh_->layout();
   double fastest = 0, rate = 0;
   for (int b = 0; b < mesh_->size(); ++b) {
@@ -75,7 +75,10 @@ void Transport::after_regrid() {
   largest_rate_ = amr::global_max(rate, mesh_->comm());
 }
 
-double Transport::max_dt() const { return largest_rate_ > 0 ? COURANT / largest_rate_ : 1e30; }
+double Transport::front_speed() {
+  measure();
+  return fastest_;
+}
 
 // v.grad phi of eq. (1).
 void Transport::carry_phase(int b, const Moment& base, const Moment& from, const Moment& to, double dt) const {
@@ -175,7 +178,14 @@ void Transport::stage(const Moment& base, const Moment& from, const Moment& to, 
 }
 
 void Transport::advance(double, double dt, std::int64_t) {
+  measure();
+  if (largest_rate_ == 0) return;
   fluxes_->prepare();
+  const int steps = std::max(1, static_cast<int>(std::ceil(dt * largest_rate_ / COURANT - 1e-9)));
+  for (int i = 0; i < steps; ++i) carry(dt / steps);
+}
+
+void Transport::carry(double dt) {
   stage(now_, now_, first_, dt / 3);
   stage(now_, first_, second_, dt / 2);
   stage(now_, second_, first_, dt);

@@ -13,6 +13,7 @@ namespace dendrift::physics {
 /// (2002)). psi, smooth across the interface, is carried as it is. c moves by fluxes, so that no solute is lost:
 /// flux = v A(phi_f) [1+(1-k) U_f], A = [1+k-(1-k)phi]/2, with A(phi_f) taken from psi to fourth order, so that c
 /// follows phi and a uniform U stays uniform, and U_f limited (Koren), so that U makes no new extremes.
+/// Takes as many steps of its own as the velocity needs within a step of growth.
 /// Reads the face field "velocity" and the cell fields psi and c.
 class Transport : public Module {
  public:
@@ -20,17 +21,16 @@ class Transport : public Module {
   const char* name() const override { return "transport"; }
   void declare(amr::FieldTable& fields) override;
   void attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) override;
-  void initialize() override { after_regrid(); }
-  void after_regrid() override;
-  double max_dt() const override;
   void advance(double t, double dt, std::int64_t step) override;
-  double front_speed() override { return fastest_; }
+  double front_speed() override;
 
  private:
   /// Phase and solute of one moment of a step.
   struct Moment {
     amr::CellField psi, c;
   };
+  void measure();
+  void carry(double dt);
   void stage(const Moment& base, const Moment& from, const Moment& to, double dt);
   void carry_phase(int b, const Moment& base, const Moment& from, const Moment& to, double dt) const;
   void carry_solute(int b, const Moment& base, const Moment& from, const Moment& to, double dt);

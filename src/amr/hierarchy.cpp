@@ -1,0 +1,580 @@
+#include "amr/hierarchy.hpp"
+
+#include <algorithm>
+#include <map>
+#include <unordered_map>
+
+#include "amr/face_transfer.hpp"
+
+namespace dendrift::amr {
+
+namespace {
+
+constexpr int TAG = 120;
+constexpr int G = Layout::GHOSTS;
+constexpr int COARSEST_CELLS = 2;
+
+std::size_t at(int i) { return static_cast<std::size_t>(i); }
+
+BlockIndex parent_of(BlockIndex b) {
+  --b.level;
+  for (int& c : b.coord) c >>= 1;
+  return b;
+}
+
+std::uint64_t key(const IntVec& coord) {
+  std::uint64_t k = 0;
+  for (const int c : coord) k = (k << 21) | static_cast<std::uint64_t>(c);
+  return k;
+}
+
+int face_of(int axis, bool high) { return 2 * axis + (high ? 1 : 0); }
+
+int towards(int axis, int step) {
+  IntVec o{};
+  o[axis] = step;
+  return direction_index(o);
+}
+
+// Linear value at a fine place.
+double interpolate_linear(const ArrayRef<const double>& c, const IntVec& fine, int normal) {
+  double sum = 0;
+  for (int corner = 0; corner < CHILDREN; ++corner) {
+    double w = 1;
+    IntVec at{};
+    for (int a = 0; a < DIM; ++a) {
+      const bool far = (corner >> a & 1) != 0, odd = (fine[a] & 1) != 0;
+      at[a] = fine[a] >> 1;
+      if (a == normal) {
+        w *= odd ? 0.5 : far ? 0.0 : 1.0;
+        if (far) ++at[a];
+      } else {
+        w *= far ? 0.25 : 0.75;
+        if (far) at[a] += odd ? 1 : -1;
+      }
+    }
+    if (w != 0) sum += w * *c.at(at);
+  }
+  return sum;
+}
+
+}  // namespace
+
+HierarchyField::HierarchyField(const Hierarchy& h, std::vector<Component> components) : components_(std::move(components)) {
+  for (int g = 0; g < h.grids(); ++g) {
+    const Layout& layout = h.grid(g).layout;
+    layouts_.push_back(layout);
+    size_.push_back(layout.size());
+    origin_.push_back(layout.interior());
+    data_.emplace_back(static_cast<std::size_t>(layout.size()) * components_.size() * h.grid(g).local.size(), 0.0);
+  }
+}
+
+ArrayRef<double> HierarchyField::ref(int g, int i, int c) { return array_ref(at(g, i, c), layouts_[static_cast<std::size_t>(g)]); }
+ArrayRef<const double> HierarchyField::ref(int g, int i, int c) const { return array_ref(at(g, i, c), layouts_[static_cast<std::size_t>(g)]); }
+
+void HierarchyField::clear(int g) {
+  std::vector<double>& d = data_[static_cast<std::size_t>(g)];
+  std::fill(d.begin(), d.end(), 0.0);
+}
+
+Hierarchy::Hierarchy(const Mesh& mesh) : mesh_(mesh), rank_(mesh.rank()) {
+  add_level_grids();
+  add_grids_beneath();
+  routes_.resize(grids_.size());
+  for (int g = 0; g < grids(); ++g) connect(g);
+  for (int g = 0; g < grids(); ++g) build_routes(g);
+  places_.resize(at(mesh.size()));
+  for (int g = 0; g < levels_; ++g)
+    for (int i = 0; i < grid(g).size(); ++i)
+      if (grid(g).mine(i).leaf >= 0) places_[at(mesh.local(grid(g).mine(i).leaf))] = {g, i};
+}
+
+// Leaves come along the Morton curve, so a parent's first leaf is met first and nodes of a level stay in order.
+void Hierarchy::add_level_grids() {
+  const Tree& tree = mesh_.tree();
+  levels_ = tree.finest_level() + 1;
+  grids_.resize(at(levels_));
+  const auto of_level = [&](int level) -> Grid& { return grids_[at(levels_ - 1 - level)]; };
+  for (int l = 0; l < levels_; ++l) {
+    of_level(l).layout = mesh_.layout();
+    of_level(l).dx = mesh_.shape().dx(l);
+  }
+  for (int leaf = 0; leaf < tree.size(); ++leaf) {
+    Grid::Node n;
+    n.index = tree.leaf(leaf);
+    n.owner = mesh_.owner(leaf);
+    n.leaf = leaf;
+    while (true) {
+      std::vector<Grid::Node>& nodes = of_level(n.index.level).nodes;
+      if (!nodes.empty() && nodes.back().index == n.index) break;
+      nodes.push_back(n);
+      if (n.index.level == 0) break;
+      n.index = parent_of(n.index);
+      n.leaf = -1;
+    }
+  }
+  const int half = mesh_.layout().n / 2;
+  for (int l = 1; l < levels_; ++l) {
+    int p = 0;
+    for (Grid::Node& n : of_level(l).nodes) {
+      const BlockIndex parent = parent_of(n.index);
+      while (of_level(l - 1).nodes[at(p)].index != parent) ++p;
+      n.parent = p;
+      for (int a = 0; a < DIM; ++a) n.place[a] = (n.index.coord[a] & 1) * half;
+    }
+  }
+}
+
+// So few cells that one rank solves them faster alone than all by messages.
+void Hierarchy::add_grids_beneath() {
+  while (grids_.back().layout.n / 2 >= COARSEST_CELLS) {
+    Grid g = grids_.back();
+    for (int i = 0; i < static_cast<int>(g.nodes.size()); ++i) {
+      grids_.back().nodes[at(i)].parent = i;
+      g.nodes[at(i)].leaf = -1;
+      g.nodes[at(i)].owner = 0;
+      g.nodes[at(i)].parent = -1;
+    }
+    g.layout.n /= 2;
+    g.dx *= 2;
+    grids_.push_back(std::move(g));
+  }
+}
+
+void Hierarchy::connect(int g) {
+  Grid& grid = grids_[at(g)];
+  const int level = std::max(0, levels_ - 1 - g);
+  IntVec extent = mesh_.shape().root_blocks;
+  for (int& e : extent) e <<= level;
+  const Array<bool> periodic = mesh_.shape().periodic();
+  std::unordered_map<std::uint64_t, int> number;
+  number.reserve(grid.nodes.size());
+  for (std::size_t i = 0; i < grid.nodes.size(); ++i) number[key(grid.nodes[i].index.coord)] = static_cast<int>(i);
+  for (std::size_t i = 0; i < grid.nodes.size(); ++i) {
+    Grid::Node& n = grid.nodes[i];
+    if (n.owner == rank_) {
+      n.local = static_cast<int>(grid.local.size());
+      grid.local.push_back(static_cast<int>(i));
+    }
+    for (int d = 0; d < DIRECTIONS; ++d) {
+      const IntVec o = direction_offset(d);
+      IntVec c = n.index.coord;
+      bool inside = true;
+      for (int a = 0; a < DIM; ++a) {
+        c[a] += o[a];
+        if (c[a] >= 0 && c[a] < extent[a]) continue;
+        if (periodic[a]) {
+          c[a] = (c[a] + extent[a]) % extent[a];
+        } else {
+          inside = false;
+        }
+      }
+      int& to = n.neighbours[at(d)];
+      to = Grid::OUTSIDE;
+      if (!inside) continue;
+      const auto found = number.find(key(c));
+      to = found == number.end() ? Grid::COARSER : found->second;
+    }
+  }
+}
+
+// lists(emit): calls emit(dst_node, dst_owner, src_node, src_owner, tag, order) for every transfer that concerns this
+// rank, with local node numbers where they are ours.
+template <class Lists>
+Hierarchy::Route Hierarchy::make_route(Lists&& lists) {
+  Route route;
+  std::map<int, Message> by_rank;
+  lists([&](const Item& item, int dst_owner, int src_owner) {
+    if (dst_owner == rank_ && src_owner == rank_) {
+      route.local.push_back(item);
+    } else if (dst_owner == rank_) {
+      by_rank[src_owner].recv.push_back(item);
+    } else if (src_owner == rank_) {
+      by_rank[dst_owner].send.push_back(item);
+    }
+  });
+  for (auto& [rank, m] : by_rank) {
+    m.rank = rank;
+    const auto before = [](const Item& a, const Item& b) { return a.order < b.order; };
+    std::sort(m.send.begin(), m.send.end(), before);
+    std::sort(m.recv.begin(), m.recv.end(), before);
+    route.messages.push_back(std::move(m));
+  }
+  return route;
+}
+
+void Hierarchy::build_routes(int g) {
+  const Grid& grid = grids_[at(g)];
+  Routes& r = routes_[at(g)];
+  r.same = make_route([&](auto&& emit) {
+    for (std::size_t i = 0; i < grid.nodes.size(); ++i)
+      for (int d = 0; d < DIRECTIONS; ++d) {
+        const int from = grid.nodes[i].neighbours[at(d)];
+        if (d == CENTRE || from < 0) continue;
+        const Grid::Node &to_node = grid.nodes[i], &from_node = grid.nodes[at(from)];
+        if (to_node.owner != rank_ && from_node.owner != rank_) continue;
+        // The tag names the destination as well: its surroundings decide how much is copied.
+        emit(Item{static_cast<int>(i), from_node.local, d, static_cast<int>(i) * DIRECTIONS + d}, to_node.owner,
+             from_node.owner);
+      }
+  });
+  if (g + 1 == grids()) return;
+  const Grid& coarse = grids_[at(g + 1)];
+  r.from_parent = make_route([&](auto&& emit) {
+    for (std::size_t i = 0; i < grid.nodes.size(); ++i) {
+      const Grid::Node &n = grid.nodes[i], &p = coarse.nodes[at(n.parent)];
+      emit(Item{static_cast<int>(i), p.local, 0, static_cast<int>(i)}, n.owner, p.owner);
+    }
+  });
+  r.to_parent = make_route([&](auto&& emit) {
+    for (std::size_t i = 0; i < grid.nodes.size(); ++i) {
+      const Grid::Node &n = grid.nodes[i], &p = coarse.nodes[at(n.parent)];
+      emit(Item{p.local, static_cast<int>(i), 0, static_cast<int>(i)}, p.owner, n.owner);
+    }
+  });
+  // The high faces of a node that has a coarser leaf beyond are the low faces of that leaf.
+  r.to_plane = make_route([&](auto&& emit) {
+    for (std::size_t i = 0; i < grid.nodes.size(); ++i)
+      for (int a = 0; a < DIM; ++a) {
+        const Grid::Node& n = grid.nodes[i];
+        if (n.neighbours[at(towards(a, 1))] != Grid::COARSER) continue;
+        const int beyond = coarse.nodes[at(n.parent)].neighbours[at(towards(a, 1))];
+        const Grid::Node& q = coarse.nodes[at(beyond)];
+        emit(Item{q.local, static_cast<int>(i), a, static_cast<int>(i) * DIM + a}, q.owner, n.owner);
+      }
+  });
+}
+
+template <class Size, class Pack, class Unpack, class Direct>
+void Hierarchy::run(Route& r, Size&& size, Pack&& pack, Unpack&& unpack, Direct&& direct) {
+  std::vector<MPI_Request> requests;
+  requests.reserve(2 * r.messages.size());
+  for (Message& m : r.messages) {
+    std::ptrdiff_t total = 0;
+    for (const Item& item : m.recv) total += size(item);
+    m.recv_buffer.resize(static_cast<std::size_t>(total));
+    if (total > 0)
+      MPI_Irecv(m.recv_buffer.data(), static_cast<int>(total), MPI_DOUBLE, m.rank, TAG, mesh_.comm(), &requests.emplace_back());
+  }
+  for (Message& m : r.messages) {
+    std::ptrdiff_t total = 0;
+    for (const Item& item : m.send) total += size(item);
+    m.send_buffer.resize(static_cast<std::size_t>(total));
+    double* p = m.send_buffer.data();
+    for (const Item& item : m.send) {
+      pack(item, p);
+      p += size(item);
+    }
+    if (total > 0)
+      MPI_Isend(m.send_buffer.data(), static_cast<int>(total), MPI_DOUBLE, m.rank, TAG, mesh_.comm(), &requests.emplace_back());
+  }
+  parallel_for(static_cast<int>(r.local.size()), [&](int i) { direct(r.local[at(i)]); });
+  MPI_Waitall(static_cast<int>(requests.size()), requests.data(), MPI_STATUSES_IGNORE);
+  for (Message& m : r.messages) {
+    const double* p = m.recv_buffer.data();
+    for (const Item& item : m.recv) {
+      unpack(item, p);
+      p += size(item);
+    }
+  }
+}
+
+Range Hierarchy::unknowns(int g, int i, const Component& c, bool composite) const {
+  const Grid& gr = grid(g);
+  const Grid::Node& n = gr.mine(i);
+  Range r{{}, filled(gr.layout.n)};
+  if (c.normal < 0) return r;
+  const int a = c.normal;
+  const int below = n.neighbours[at(towards(a, -1))], above = n.neighbours[at(towards(a, 1))];
+  int first = 0, last = gr.layout.n - 1;
+  if (below == Grid::OUTSIDE && c.sides[at(face_of(a, false))].odd) first = 1;
+  if (composite && below >= 0 && gr.nodes[at(below)].leaf < 0) first = 1;
+  if (above == Grid::COARSER || (above == Grid::OUTSIDE && !c.sides[at(face_of(a, true))].odd)) last = gr.layout.n;
+  r.lo[a] = first;
+  r.size[a] = last - first + 1;
+  return r;
+}
+
+// Ghosts of a node in one direction. A plane of faces on the far side of the box belongs to it unless another node
+// of this grid lies there and owns it.
+Range Hierarchy::ghost_box(const Grid& grid, const Grid::Node& n, int direction, const Component& c, int depth) const {
+  const IntVec o = direction_offset(direction);
+  const int cells = grid.layout.n;
+  Range r;
+  for (int a = 0; a < DIM; ++a) {
+    r.lo[a] = o[a] < 0 ? -depth : o[a] > 0 ? cells : 0;
+    r.size[a] = o[a] == 0 ? cells : depth;
+    if (a != c.normal) continue;
+    if (o[a] == 0) {
+      IntVec beyond = o;
+      beyond[a] = 1;
+      if (n.neighbours[at(direction_index(beyond))] < 0) ++r.size[a];
+    } else if (o[a] > 0 && depth == 1) {
+      r.size[a] = 2;  // the plane at the side, and the first beyond it
+    }
+  }
+  return r;
+}
+
+void Hierarchy::exchange(HierarchyField& f, int g, int depth, bool homogeneous) {
+  const Grid& gr = grid(g);
+  const int nc = f.components();
+  const auto box = [&](const Item& item, int c) {
+    return ghost_box(gr, gr.nodes[at(item.dst)], item.tag, f.component(c), depth);
+  };
+  const auto shifted = [&](IntVec lo, int d) {
+    const IntVec o = direction_offset(d);
+    for (int a = 0; a < DIM; ++a) lo[a] -= o[a] * gr.layout.n;
+    return lo;
+  };
+  run(
+      routes_[at(g)].same,
+      [&](const Item& item) {
+        std::ptrdiff_t total = 0;
+        for (int c = 0; c < nc; ++c) total += volume(box(item, c).size);
+        return total;
+      },
+      [&](const Item& item, double* p) {
+        for (int c = 0; c < nc; ++c) {
+          const Range r = box(item, c);
+          copy_box(packed_ref(p, r.size), {}, std::as_const(f).ref(g, item.src, c), shifted(r.lo, item.tag), r.size);
+          p += volume(r.size);
+        }
+      },
+      [&](const Item& item, const double* p) {
+        for (int c = 0; c < nc; ++c) {
+          const Range r = box(item, c);
+          copy_box(f.ref(g, gr.nodes[at(item.dst)].local, c), r.lo, packed_ref(p, r.size), {}, r.size);
+          p += volume(r.size);
+        }
+      },
+      [&](const Item& item) {
+        for (int c = 0; c < nc; ++c) {
+          const Range r = box(item, c);
+          copy_box(f.ref(g, gr.nodes[at(item.dst)].local, c), r.lo, std::as_const(f).ref(g, item.src, c),
+                   shifted(r.lo, item.tag), r.size);
+        }
+      });
+  parallel_for(gr.size(), [&](int i) { apply_sides(f, g, i, depth, homogeneous); });
+}
+
+// Axis by axis over all rows, ghosts included, so that edges and corners follow from what is there.
+void Hierarchy::apply_sides(HierarchyField& f, int g, int i, int depth, bool homogeneous) const {
+  const Grid& gr = grid(g);
+  const Grid::Node& n = gr.mine(i);
+  const int cells = gr.layout.n;
+  for (int axis = 0; axis < DIM; ++axis)
+    for (const bool high : {false, true}) {
+      if (n.neighbours[at(towards(axis, high ? 1 : -1))] != Grid::OUTSIDE) continue;
+      for (int c = 0; c < f.components(); ++c) {
+        const Component& component = f.component(c);
+        const MirrorRule rule = component.sides[at(face_of(axis, high))];
+        const double value = homogeneous ? 0.0 : rule.value;
+        const ArrayRef<double> x = f.ref(g, i, c);
+        IntVec lo = filled(-G), size = filled(cells + 2 * G);
+        size[axis] = 1;
+        const auto plane = [&](int to, int from) {
+          IntVec at_to = lo;
+          at_to[axis] = to;
+          const std::ptrdiff_t back = (from - to) * x.stride[axis];
+          for_each_cell(at_to, size, [&](const IntVec& q) {
+            double* p = x.at(q);
+            *p = rule.odd ? 2 * value - p[back] : p[back];
+          });
+        };
+        if (component.normal == axis) {
+          const int side = high ? cells : 0;
+          if (rule.odd) {
+            IntVec at_side = lo;
+            at_side[axis] = side;
+            for_each_cell(at_side, size, [&](const IntVec& q) { *x.at(q) = value; });
+          }
+          for (int k = 1; k <= (high ? 1 : depth); ++k) plane(high ? side + k : side - k, high ? side - k : side + k);
+        } else {
+          for (int k = 0; k < depth; ++k) plane(high ? cells + k : -1 - k, high ? cells - 1 - k : k);
+        }
+      }
+    }
+}
+
+// use(local node, parents): parents[c] is the array of the parent, shifted so that its cell 0 holds the node's.
+template <class F>
+void Hierarchy::with_parents(HierarchyField& f, int g, F&& use) {
+  const Grid& gr = grid(g);
+  const int nc = f.components();
+  const IntVec size = filled(gr.layout.n / 2 + 2 * G);
+  using Refs = std::vector<ArrayRef<const double>>;
+  const auto patch = [&](int src, const Grid::Node& n, int c) {
+    ArrayRef<const double> r = std::as_const(f).ref(g + 1, src, c);
+    r.p = r.at(n.place);
+    return r;
+  };
+  run(
+      routes_[at(g)].from_parent, [&](const Item&) { return nc * volume(size); },
+      [&](const Item& item, double* p) {
+        for (int c = 0; c < nc; ++c, p += volume(size))
+          copy_box(packed_ref(p, size), {}, patch(item.src, gr.nodes[at(item.dst)], c), filled(-G), size);
+      },
+      [&](const Item& item, const double* p) {
+        Refs refs;
+        for (int c = 0; c < nc; ++c) {
+          ArrayRef<const double> r = packed_ref(p + c * volume(size), size);
+          r.p = r.at(filled(G));
+          refs.push_back(r);
+        }
+        use(gr.nodes[at(item.dst)].local, refs);
+      },
+      [&](const Item& item) {
+        Refs refs;
+        for (int c = 0; c < nc; ++c) refs.push_back(patch(item.src, gr.nodes[at(item.dst)], c));
+        use(gr.nodes[at(item.dst)].local, refs);
+      });
+}
+
+void Hierarchy::fill_from_coarser(HierarchyField& f, int g) {
+  if (g + 1 >= levels_) return;
+  const Grid& gr = grid(g);
+  with_parents(f, g, [&](int i, const std::vector<ArrayRef<const double>>& parents) {
+    const Grid::Node& n = gr.mine(i);
+    for (int d = 0; d < DIRECTIONS; ++d) {
+      if (n.neighbours[at(d)] != Grid::COARSER) continue;
+      const IntVec o = direction_offset(d);
+      for (int c = 0; c < f.components(); ++c) {
+        const int a = f.component(c).normal;
+        Range r;
+        for (int b = 0; b < DIM; ++b) {
+          r.lo[b] = o[b] < 0 ? -G : o[b] > 0 ? gr.layout.n : 0;
+          r.size[b] = o[b] == 0 ? gr.layout.n : G;
+        }
+        if (d == towards(std::max(a, 0), 1) && a >= 0) {  // the plane at the side is the node's own
+          ++r.lo[a];
+          --r.size[a];
+        } else if (a >= 0 && o[a] == 0 && n.neighbours[at(towards(a, 1))] < 0) {
+          ++r.size[a];
+        }
+        const ArrayRef<double> x = f.ref(g, i, c);
+        for_each_cell(r.lo, r.size, [&](const IntVec& q) { *x.at(q) = fine_value(parents[at(c)], q, a, gr.layout.n); });
+      }
+    }
+  });
+}
+
+void Hierarchy::prolong_add(HierarchyField& f, int g) {
+  with_parents(f, g, [&](int i, const std::vector<ArrayRef<const double>>& parents) {
+    for (int c = 0; c < f.components(); ++c) {
+      const Range r = unknowns(g, i, f.component(c), false);
+      const ArrayRef<double> x = f.ref(g, i, c);
+      const int a = f.component(c).normal;
+      for_each_cell(r.lo, r.size, [&](const IntVec& q) { *x.at(q) += interpolate_linear(parents[at(c)], q, a); });
+    }
+  });
+  fill_from_coarser(f, g);
+}
+
+// value(array, place in the finer grid, normal, below, above): what a coarse cell or face receives from the fine ones
+// that start at that place.
+template <class Value>
+void Hierarchy::restrict_by(const HierarchyField& from, HierarchyField& to, int g, Value&& value) {
+  const Grid& gr = grid(g);
+  const int nc = from.components(), half = gr.layout.n / 2;
+  const IntVec size = filled(half);
+  const auto quadrant = [&](int i, const ArrayRef<double>& dst, const IntVec& lo, int c) {
+    const ArrayRef<const double> x = from.ref(g, i, c);
+    const int a = from.component(c).normal;
+    const bool open_below = a >= 0 && gr.mine(i).neighbours[at(towards(a, -1))] < 0;
+    for_each_cell({}, size, [&](const IntVec& q) {
+      IntVec fine{}, coarse{};
+      for (int b = 0; b < DIM; ++b) {
+        fine[b] = 2 * q[b];
+        coarse[b] = lo[b] + q[b];
+      }
+      *dst.at(coarse) = value(x.at(fine), x.stride, a, open_below && q[std::max(a, 0)] == 0, false);
+    });
+  };
+  const auto local = [&](int node) { return gr.nodes[at(node)].local; };
+  run(
+      routes_[at(g)].to_parent, [&](const Item&) { return nc * volume(size); },
+      [&](const Item& item, double* p) {
+        for (int c = 0; c < nc; ++c, p += volume(size)) quadrant(local(item.src), packed_ref(p, size), {}, c);
+      },
+      [&](const Item& item, const double* p) {
+        for (int c = 0; c < nc; ++c, p += volume(size))
+          copy_box(to.ref(g + 1, item.dst, c), gr.nodes[at(item.src)].place, packed_ref(p, size), {}, size);
+      },
+      [&](const Item& item) {
+        for (int c = 0; c < nc; ++c)
+          quadrant(local(item.src), to.ref(g + 1, item.dst, c), gr.nodes[at(item.src)].place, c);
+      });
+  const auto plane = [&](int i, int a, const ArrayRef<double>& dst, const IntVec& lo, int c) {
+    const ArrayRef<const double> x = from.ref(g, i, c);
+    IntVec flat = size;
+    flat[a] = 1;
+    for_each_cell({}, flat, [&](const IntVec& q) {
+      IntVec fine{}, coarse{};
+      for (int b = 0; b < DIM; ++b) {
+        fine[b] = b == a ? gr.layout.n : 2 * q[b];
+        coarse[b] = b == a ? 0 : lo[b] + q[b];
+      }
+      *dst.at(coarse) = value(x.at(fine), x.stride, a, false, true);
+    });
+  };
+  const auto flat_size = [&](int a) {
+    IntVec flat = size;
+    flat[a] = 1;
+    return flat;
+  };
+  const auto place = [&](const Item& item) {
+    IntVec lo = gr.nodes[at(item.src)].place;
+    lo[item.tag] = 0;
+    return lo;
+  };
+  const auto component_along = [&](int a) {
+    for (int c = 0; c < nc; ++c)
+      if (from.component(c).normal == a) return c;
+    return -1;
+  };
+  run(
+      routes_[at(g)].to_plane,
+      [&](const Item& item) { return component_along(item.tag) < 0 ? std::ptrdiff_t{0} : volume(flat_size(item.tag)); },
+      [&](const Item& item, double* p) {
+        if (const int c = component_along(item.tag); c >= 0)
+          plane(local(item.src), item.tag, packed_ref(p, flat_size(item.tag)), {}, c);
+      },
+      [&](const Item& item, const double* p) {
+        const IntVec flat = flat_size(item.tag);
+        if (const int c = component_along(item.tag); c >= 0)
+          copy_box(to.ref(g + 1, item.dst, c), place(item), packed_ref(p, flat), {}, flat);
+      },
+      [&](const Item& item) {
+        if (const int c = component_along(item.tag); c >= 0)
+          plane(local(item.src), item.tag, to.ref(g + 1, item.dst, c), place(item), c);
+      });
+}
+
+void Hierarchy::restrict_means(const HierarchyField& from, HierarchyField& to, int g) {
+  restrict_by(from, to, g, [](const double* p, const Array<std::ptrdiff_t>& stride, int normal, bool, bool) {
+    return mean_across(p, stride, normal);
+  });
+}
+
+void Hierarchy::restrict_weighted(const HierarchyField& from, HierarchyField& to, int g) {
+  restrict_by(from, to, g, [](const double* p, const Array<std::ptrdiff_t>& stride, int normal, bool no_below, bool no_above) {
+    if (normal < 0) return mean_across(p, stride, normal);
+    const std::ptrdiff_t s = stride[normal];
+    const double centre = mean_across(p, stride, normal);
+    const double below = no_below ? centre : mean_across(p - s, stride, normal);
+    const double above = no_above ? centre : mean_across(p + s, stride, normal);
+    return 0.5 * centre + 0.25 * (below + above);
+  });
+}
+
+void Hierarchy::make_composite(HierarchyField& f, int depth, bool homogeneous) {
+  for (int g = 0; g + 1 < levels_; ++g) restrict_means(f, f, g);
+  for (int g = levels_ - 1; g >= 0; --g) {
+    fill_from_coarser(f, g);
+    exchange(f, g, g == 0 ? depth : G, homogeneous);
+  }
+}
+
+}  // namespace dendrift::amr

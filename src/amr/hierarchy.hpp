@@ -1,0 +1,162 @@
+/// \file
+/// Every node of the tree, level by level, parents included, and grids of fewer and fewer cells beneath the roots:
+/// the ladder that multigrid climbs, and the arrays that live on it.
+#pragma once
+
+#include <mpi.h>
+
+#include <array>
+#include <vector>
+
+#include "amr/mesh.hpp"
+#include "amr/transfer.hpp"
+
+namespace dendrift::amr {
+
+/// What lies beyond a side of the domain. For cells, and for velocities along the side: the mirror image with
+/// the same (even) or the opposite sign (odd, about `value`). For the velocity through the side: fixed at
+/// `value` on it (odd), or free (even).
+struct MirrorRule {
+  bool odd = false;
+  double value = 0;
+};
+
+/// Centring and side rules of one component of a field on the hierarchy.
+struct Component {
+  int normal = -1;  ///< cells, or the axis whose faces carry it (index i: the low face of cell i)
+  std::array<MirrorRule, FACES> sides{};
+};
+
+/// The nodes of one level. All ranks know all nodes; a parent belongs to the rank of its first leaf.
+struct Grid {
+  static constexpr int COARSER = -1;  ///< a leaf of the next coarser level lies there
+  static constexpr int OUTSIDE = -2;
+
+  struct Node {
+    BlockIndex index;
+    int owner = 0;
+    int leaf = -1;    ///< number in the tree; -1: refined, or beneath the roots
+    int local = -1;   ///< position in `local`, -1: another rank's
+    int parent = -1;  ///< node of the next coarser grid
+    IntVec place{};   ///< where it starts in its parent, cells of the parent
+    std::array<int, DIRECTIONS> neighbours{};  ///< node, COARSER or OUTSIDE
+  };
+
+  Layout layout;
+  double dx = 1;
+  std::vector<Node> nodes;
+  std::vector<int> local;  ///< this rank's nodes
+
+  const Node& mine(int i) const { return nodes[static_cast<std::size_t>(local[static_cast<std::size_t>(i)])]; }
+  int size() const { return static_cast<int>(local.size()); }
+};
+
+class Hierarchy;
+
+/// Arrays of some components on all of this rank's nodes.
+class HierarchyField {
+ public:
+  HierarchyField() = default;
+  HierarchyField(const Hierarchy& h, std::vector<Component> components);
+  int components() const { return static_cast<int>(components_.size()); }
+  const Component& component(int c) const { return components_[static_cast<std::size_t>(c)]; }
+  /// Cell (0,0[,0]) of component c in local node i of grid g.
+  double* at(int g, int i, int c) { return data_[static_cast<std::size_t>(g)].data() + offset(g, i, c); }
+  const double* at(int g, int i, int c) const { return data_[static_cast<std::size_t>(g)].data() + offset(g, i, c); }
+  ArrayRef<double> ref(int g, int i, int c);
+  ArrayRef<const double> ref(int g, int i, int c) const;
+  void clear(int g);
+  /// Sets the values of odd side rules.
+  void set_side(int c, int face, double value) { components_[static_cast<std::size_t>(c)].sides[static_cast<std::size_t>(face)].value = value; }
+
+ private:
+  std::ptrdiff_t offset(int g, int i, int c) const {
+    return (static_cast<std::ptrdiff_t>(i) * components() + c) * size_[static_cast<std::size_t>(g)] + origin_[static_cast<std::size_t>(g)];
+  }
+  std::vector<Component> components_;
+  std::vector<Layout> layouts_;
+  std::vector<std::ptrdiff_t> size_, origin_;
+  std::vector<std::vector<double>> data_;
+};
+
+/// First and last index, along its own axis, of the faces of a node that are unknowns of its grid: its low face
+/// unless fixed by a wall; its high face only where no node of the same grid lies beyond.
+struct Range {
+  IntVec lo{}, size{};
+};
+
+/// Grid 0 is the finest level of the tree; grid levels()-1 the roots; then roots of half the cells, down to 2.
+class Hierarchy {
+ public:
+  explicit Hierarchy(const Mesh& mesh);
+
+  int grids() const { return static_cast<int>(grids_.size()); }
+  int levels() const { return levels_; }  ///< grids that are levels of the tree
+  const Grid& grid(int g) const { return grids_[static_cast<std::size_t>(g)]; }
+  const Mesh& mesh() const { return mesh_; }
+  /// Grid and local node of a local block.
+  struct Place {
+    int grid, node;
+  };
+  Place place_of_block(int b) const { return places_[static_cast<std::size_t>(b)]; }
+  int block(int g, int i) const { return mesh_.local(grid(g).mine(i).leaf); }
+
+  /// Unknowns of component c in local node i. `composite`: leave out what finer nodes own instead.
+  Range unknowns(int g, int i, const Component& c, bool composite) const;
+
+  /// Ghosts of grid g from nodes of the same grid, and beyond the sides; `homogeneous`: side values count as 0.
+  void exchange(HierarchyField& f, int g, int depth, bool homogeneous = true);
+  /// Ghosts of grid g where the next coarser grid has leaves, third order. Ghosts of grid g+1 must be filled.
+  void fill_from_coarser(HierarchyField& f, int g);
+  /// Grid g += interpolation of grid g+1, linear, and ghosts as fill_from_coarser. Ghosts of g+1 must be filled.
+  void prolong_add(HierarchyField& f, int g);
+  /// Parents in grid g+1 = means of grid g: of the cells, or of the faces that make up a face.
+  void restrict_means(const HierarchyField& from, HierarchyField& to, int g);
+  /// Parents in grid g+1 = means of grid g, faces weighted over both sides of the plane as well (full weighting).
+  void restrict_weighted(const HierarchyField& from, HierarchyField& to, int g);
+  /// Leaves have data: fills parents, then all ghosts, so that every leaf sees the composite solution round it.
+  void make_composite(HierarchyField& f, int depth, bool homogeneous);
+
+ private:
+  struct Item {
+    int dst, src;  // nodes; local numbers where they are ours
+    int tag;
+    int order;     // agreed on by both sides
+  };
+  struct Message {
+    int rank = 0;
+    std::vector<Item> send, recv;
+    std::vector<double> send_buffer, recv_buffer;
+  };
+  struct Route {
+    std::vector<Item> local;
+    std::vector<Message> messages;
+  };
+  struct Routes {
+    Route same, from_parent, to_parent, to_plane;
+  };
+
+  void add_level_grids();
+  void add_grids_beneath();
+  void connect(int g);
+  void build_routes(int g);
+  template <class Lists>
+  Route make_route(Lists&& lists);
+  template <class Size, class Pack, class Unpack, class Direct>
+  void run(Route& r, Size&& size, Pack&& pack, Unpack&& unpack, Direct&& direct);
+  template <class F>
+  void with_parents(HierarchyField& f, int g, F&& use);
+  template <class PlaneValue>
+  void restrict_by(const HierarchyField& from, HierarchyField& to, int g, PlaneValue&& value);
+  Range ghost_box(const Grid& grid, const Grid::Node& n, int direction, const Component& c, int depth) const;
+  void apply_sides(HierarchyField& f, int g, int i, int depth, bool homogeneous) const;
+
+  const Mesh& mesh_;
+  int rank_;
+  int levels_ = 0;
+  std::vector<Grid> grids_;
+  std::vector<Routes> routes_;
+  std::vector<Place> places_;
+};
+
+}  // namespace dendrift::amr

@@ -1,0 +1,129 @@
+#include "amr/krylov.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+#include "amr/loops.hpp"
+
+namespace dendrift::amr {
+
+namespace {
+std::size_t at(int i) { return static_cast<std::size_t>(i); }
+}  // namespace
+
+std::vector<double> Pieces::products(const std::vector<double>& v, std::span<const std::vector<double>> with) const {
+  const int pieces = static_cast<int>(first.size()) - 1;
+  const std::size_t count = with.size();
+  std::vector<double> partial(at(pieces) * count);
+  parallel_for(pieces, [&](int i) {
+    const std::ptrdiff_t begin = first[at(i)], size = first[at(i) + 1] - begin;
+    thread_local std::vector<double> weighted;
+    weighted.resize(static_cast<std::size_t>(size));
+    double* w = weighted.data();
+    for (std::ptrdiff_t q = 0; q < size; ++q)
+      w[q] = weight[static_cast<std::size_t>(begin + q)] * v[static_cast<std::size_t>(begin + q)];
+    for (std::size_t k = 0; k < count; ++k) {
+      const double* u = with[k].data() + begin;
+      double sum = 0;
+#pragma omp simd reduction(+ : sum)
+      for (std::ptrdiff_t q = 0; q < size; ++q) sum += w[q] * u[q];
+      partial[at(i) * count + k] = sum;
+    }
+  });
+  std::vector<ExactSum> sums(count);
+  for (int i = 0; i < pieces; ++i)
+    for (std::size_t k = 0; k < count; ++k) sums[k].add(partial[at(i) * count + k]);
+  return exact_sums(sums, comm);
+}
+
+double Pieces::norm(const std::vector<double>& v) const {
+  return std::sqrt(std::max(0.0, products(v, std::span(&v, 1)).front()));
+}
+
+GmresResult Gmres::solve(Vector& x, const Pieces& pieces, const GmresOptions& o,
+                         const std::function<double(const Vector& x, double residual)>& target) {
+  GmresResult result;
+  const std::size_t n = pieces.size();
+  const int m = o.restart;
+  if (basis_.size() < at(m + 1)) basis_.resize(at(m + 1));
+  for (Vector& v : basis_)
+    if (v.size() != n) v.assign(n, 0.0);
+  const auto axpy = [&](double a, const Vector& u, Vector& v) {
+#pragma omp parallel for simd
+    for (std::size_t q = 0; q < n; ++q) v[q] += a * u[q];
+  };
+  const auto scale = [&](double a, Vector& v) {
+#pragma omp parallel for simd
+    for (std::size_t q = 0; q < n; ++q) v[q] *= a;
+  };
+  // w -= sum of p_j basis_j, in one go over memory
+  const auto subtract = [&](const std::vector<double>& p, int count, Vector& w) {
+    constexpr std::size_t CHUNK = 2048;
+    parallel_for(static_cast<int>((n + CHUNK - 1) / CHUNK), [&](int i) {
+      const std::size_t begin = at(i) * CHUNK, end = std::min(n, begin + CHUNK);
+      for (int j = 0; j < count; ++j) {
+        const double *u = basis_[at(j)].data(), a = p[at(j)];
+#pragma omp simd
+        for (std::size_t q = begin; q < end; ++q) w[q] -= a * u[q];
+      }
+    });
+  };
+  while (true) {
+    residual(x, basis_[0]);
+    precondition(basis_[0]);
+    const double beta = pieces.norm(basis_[0]);
+    result.residual = beta;
+    const double goal = target(x, beta);
+    result.converged = beta <= goal;
+    if (result.converged || result.iterations >= o.max_iterations || !std::isfinite(beta)) return result;
+    scale(1 / beta, basis_[0]);
+    std::vector<std::vector<double>> h;  // columns of the upper triangle after rotation
+    std::vector<double> c, s, g{beta};
+    int k = 0;
+    for (; k < m && result.iterations < o.max_iterations; ++k) {
+      ++result.iterations;
+      Vector& w = basis_[at(k + 1)];
+      apply(basis_[at(k)], w);
+      precondition(w);
+      std::vector<double> column(at(k + 2), 0.0);
+      // Classical Gram-Schmidt, one sum over the ranks instead of k; again where so much was taken off that round-off
+      // would show.
+      double length = 0, before = 0;
+      constexpr double LOST = 1e-2;
+      do {
+        const std::vector<double> p = pieces.products(w, std::span(basis_.data(), at(k + 2)));
+        before = std::sqrt(p[at(k + 1)]);
+        subtract(p, k + 1, w);
+        for (int j = 0; j <= k; ++j) column[at(j)] += p[at(j)];
+        length = pieces.norm(w);
+      } while (length < LOST * before && length > 1e-13 * beta);
+      column[at(k + 1)] = length;
+      for (int j = 0; j < k; ++j) {
+        const double a = column[at(j)], b = column[at(j + 1)];
+        column[at(j)] = c[at(j)] * a + s[at(j)] * b;
+        column[at(j + 1)] = -s[at(j)] * a + c[at(j)] * b;
+      }
+      const double r = std::hypot(column[at(k)], column[at(k + 1)]);
+      c.push_back(column[at(k)] / r);
+      s.push_back(column[at(k + 1)] / r);
+      column[at(k)] = r;
+      h.push_back(std::move(column));
+      g.push_back(-s[at(k)] * g[at(k)]);
+      g[at(k)] *= c[at(k)];
+      if (std::abs(g[at(k + 1)]) <= goal || length <= 1e-14 * beta) {
+        ++k;
+        break;
+      }
+      scale(1 / length, w);
+    }
+    std::vector<double> y(at(k));
+    for (int i = k - 1; i >= 0; --i) {
+      double sum = g[at(i)];
+      for (int j = i + 1; j < k; ++j) sum -= h[at(j)][at(i)] * y[at(j)];
+      y[at(i)] = sum / h[at(i)][at(i)];
+    }
+    for (int j = 0; j < k; ++j) axpy(y[at(j)], basis_[at(j)], x);
+  }
+}
+
+}  // namespace dendrift::amr

@@ -1,0 +1,53 @@
+/// \file
+/// GMRES with a preconditioner on the left, on vectors that are cut into pieces by blocks.
+#pragma once
+
+#include <functional>
+#include <span>
+#include <vector>
+
+#include "amr/comm.hpp"
+
+namespace dendrift::amr {
+
+/// The pieces of a distributed vector, one a local block. Products are summed within a piece in order and over pieces
+/// exactly, so they do not depend on ranks or threads.
+struct Pieces {
+  std::vector<std::ptrdiff_t> first{0};  ///< first[i] to first[i+1]: piece i
+  std::vector<double> weight;            ///< of each entry in products, > 0
+  MPI_Comm comm = MPI_COMM_NULL;
+
+  std::size_t size() const { return static_cast<std::size_t>(first.back()); }
+  /// Weighted products of v with some vectors. Collective.
+  std::vector<double> products(const std::vector<double>& v, std::span<const std::vector<double>> with) const;
+  double norm(const std::vector<double>& v) const;
+};
+
+struct GmresOptions {
+  int max_iterations = 200;
+  int restart = 50;
+};
+
+struct GmresResult {
+  int iterations = 0;
+  double residual = 0;  ///< norm of the preconditioned residual, recomputed at the end
+  bool converged = false;
+};
+
+/// Solves K x = b by corrections to x. residual(x, r): r = b - K x. apply(v, w): w = K v for a correction.
+/// precondition(r): in place. Collective.
+class Gmres {
+ public:
+  using Vector = std::vector<double>;
+  std::function<void(const Vector&, Vector&)> residual, apply;
+  std::function<void(Vector&)> precondition;
+
+  /// `target(x, residual)`: the norm of the preconditioned residual to be reached, told the one that x has.
+  GmresResult solve(Vector& x, const Pieces& pieces, const GmresOptions& options,
+                    const std::function<double(const Vector& x, double residual)>& target);
+
+ private:
+  std::vector<Vector> basis_;
+};
+
+}  // namespace dendrift::amr

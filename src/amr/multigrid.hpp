@@ -1,0 +1,61 @@
+/// \file
+/// One V-cycle for several scalar problems at once on the hierarchy: sigma x - sum_b d_b(kappa_b d_b x) = r, each
+/// component with its own centring. Used as a preconditioner, so sides count as homogeneous.
+#pragma once
+
+#include <functional>
+#include <vector>
+
+#include "amr/hierarchy.hpp"
+
+namespace dendrift::amr {
+
+/// Where a component finds its coefficients: kappa_b between a place and the one below it along b is
+/// factor * coefficients.at(field)[place + shift]; field -1: the constant `factor`.
+struct Links {
+  double sigma = 0;
+  struct Along {
+    int field = -1;
+    int below = 0;  ///< 1: the coefficient of place i - 1 along b belongs to the link below i (cells under faces)
+    double factor = 1;
+  };
+  Array<Along> along{};
+};
+
+struct MultigridOptions {
+  int smoothings = 2;       ///< Chebyshev steps before and after the coarser grid
+  double lowest = 4;        ///< they act on eigenvalues from 2/lowest to 2 of the diagonally scaled operator
+  int bottom_steps = 40;    ///< on the coarsest grid
+};
+
+class Multigrid {
+ public:
+  Multigrid(Hierarchy& hierarchy, std::vector<Component> components, std::vector<Links> links,
+            const HierarchyField& coefficients, MultigridOptions options = {});
+
+  /// Call when the coefficients or sigma have changed.
+  void prepare(std::vector<Links> links);
+  /// Right-hand side on the leaves (the rest is overwritten); zero where nothing is unknown.
+  HierarchyField& rhs() { return rhs_; }
+  /// One cycle from zero; the result is in solution(), on the leaves of all grids.
+  void cycle();
+  HierarchyField& solution() { return x_; }
+
+ private:
+  void smooth(int g, int steps, double lowest, bool from_zero);
+  void residual(int g);
+  void couple(int g);
+  /// f(places of a row of unknowns, its length) for one component of one node.
+  template <class F>
+  void rows(int g, int i, int c, const Range& box, F&& f) const;
+  template <class F>
+  void with_operator(int g, int i, int c, F&& f) const;
+
+  Hierarchy& h_;
+  const HierarchyField& coefficients_;
+  std::vector<Links> links_;
+  MultigridOptions options_;
+  HierarchyField x_, rhs_, step_, residual_, inverse_;
+};
+
+}  // namespace dendrift::amr

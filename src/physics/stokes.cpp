@@ -1,0 +1,387 @@
+#include "physics/stokes.hpp"
+
+#include <algorithm>
+#include <cmath>
+
+namespace dendrift::physics {
+
+using amr::Component;
+using amr::Grid;
+using amr::HierarchyField;
+using amr::Layout;
+using amr::Range;
+
+namespace {
+
+std::size_t at(int i) { return static_cast<std::size_t>(i); }
+
+constexpr int EDGES = DIM == 2 ? 1 : 3;  // pairs of axes
+
+// Component of viscosity_ that holds the edges along which neither a nor b changes; 0 is the cells.
+constexpr int edge_component(int a, int b) { return DIM == 2 ? 1 : a + b; }
+
+// v and p at the sides of the box.
+std::vector<Component> stokes_components(const amr::MeshShape& shape) {
+  std::vector<Component> list(DIM + 1);
+  for (int c = 0; c <= DIM; ++c) {
+    list[at(c)].normal = c < DIM ? c : -1;
+    for (int f = 0; f < FACES; ++f) {
+      bool& odd = list[at(c)].sides[at(f)].odd;
+      switch (shape.sides[at(f)]) {
+        case amr::Side::wall: odd = c < DIM; break;
+        case amr::Side::symmetry: odd = c == face_axis(f); break;
+        case amr::Side::open: odd = c == DIM; break;
+        case amr::Side::periodic: break;
+      }
+    }
+  }
+  return list;
+}
+
+std::vector<Component> velocities(const std::vector<Component>& all) { return {all.begin(), all.begin() + DIM}; }
+
+}  // namespace
+
+StokesSolver::StokesSolver(const amr::Mesh& mesh, const StokesOptions& options)
+    : options_(options), mesh_(mesh), hierarchy_(mesh), components_(stokes_components(mesh.shape())),
+      state_(hierarchy_, components_), force_(hierarchy_, components_), work_(hierarchy_, components_),
+      image_(hierarchy_, components_), viscosity_(hierarchy_, std::vector<Component>(1 + EDGES)),
+      pressure_(hierarchy_, {components_[DIM]}) {
+  for (const amr::Side s : mesh.shape().sides) closed_ = closed_ && s != amr::Side::open;
+  velocity_cycle_ = std::make_unique<amr::Multigrid>(hierarchy_, velocities(components_), velocity_links(0), viscosity_);
+  amr::Links laplacian;
+  for (auto& along : laplacian.along) along.factor = 1;
+  pressure_cycle_ = std::make_unique<amr::Multigrid>(hierarchy_, std::vector<Component>{components_[DIM]},
+                                                     std::vector<amr::Links>{laplacian}, viscosity_);
+  gmres_.residual = [this](const Vector& x, Vector& r) {
+    unpack(x, state_);
+    hierarchy_.make_composite(state_, 1, false);
+    apply(state_, &force_, image_);
+    pack(image_, r);
+  };
+  gmres_.apply = [this](const Vector& v, Vector& w) {
+    unpack(v, work_);
+    hierarchy_.make_composite(work_, 1, true);
+    apply(work_, nullptr, image_);
+    pack(image_, w);
+  };
+  gmres_.precondition = [this](Vector& r) {
+    unpack(r, image_);
+    precondition(image_);
+    pack(image_, r);
+  };
+}
+
+template <class F>
+void StokesSolver::for_leaves(F&& f) const {
+  amr::parallel_for(mesh_.size(), [&](int b) {
+    const auto [g, i] = hierarchy_.place_of_block(b);
+    f(b, g, i, hierarchy_.grid(g).dx);
+  });
+}
+
+std::vector<amr::Links> StokesSolver::velocity_links(double sigma) const {
+  std::vector<amr::Links> links(DIM);
+  for (int a = 0; a < DIM; ++a) {
+    links[at(a)].sigma = sigma;
+    for (int b = 0; b < DIM; ++b) {
+      amr::Links::Along& along = links[at(a)].along[b];
+      along.field = a == b ? 0 : edge_component(a, b);
+      along.below = a == b ? 1 : 0;
+      along.factor = a == b && options_.stress == Stress::symmetric ? 2 : 1;
+    }
+  }
+  return links;
+}
+
+void StokesSolver::set_viscosity(const std::function<void(int, double*)>& phase, const std::function<double(double)>& law) {
+  // Edges take nu of the mean phi: an arithmetic mean of nu would make thin gaps stiff.
+  for_leaves([&](int b, int g, int i, double) {
+    const Layout& layout = hierarchy_.grid(g).layout;
+    thread_local std::vector<double> phi_array;
+    phi_array.resize(static_cast<std::size_t>(layout.size()));
+    double* phi = phi_array.data() + layout.interior();
+    phase(b, phi);
+    double* nu = viscosity_.at(g, i, 0);
+    amr::for_each_cell(filled(-Layout::GHOSTS), filled(layout.pitch()), [&](const IntVec& c) {
+      nu[layout.offset(c)] = law(phi[layout.offset(c)]);
+    });
+    for (int a = 0; a < DIM; ++a)
+      for (int e = a + 1; e < DIM; ++e) {
+        double* edge = viscosity_.at(g, i, edge_component(a, e));
+        const std::ptrdiff_t s = layout.stride(a), t = layout.stride(e);
+        amr::for_each_cell(filled(1 - Layout::GHOSTS), filled(layout.pitch() - 1), [&](const IntVec& c) {
+          const double* p = phi + layout.offset(c);
+          edge[layout.offset(c)] = law(0.25 * ((p[0] + p[-s]) + (p[-t] + p[-s - t])));
+        });
+      }
+  });
+  // Coarser grids: arithmetic means. Too stiff beside a solid, where the finer grids do the work; too soft a solid
+  // would let a coarse grid deform it, which costs 1/ratio more than it mends.
+  for (int g = 0; g + 1 < hierarchy_.grids(); ++g) {
+    hierarchy_.restrict_means(viscosity_, viscosity_, g);
+    const Grid& coarse = hierarchy_.grid(g + 1);
+    const Layout& layout = coarse.layout;
+    hierarchy_.exchange(viscosity_, g + 1, Layout::GHOSTS);
+    amr::parallel_for(coarse.size(), [&](int i) {
+      const Grid::Node& n = coarse.mine(i);
+      if (n.leaf >= 0) return;
+      double* nu = viscosity_.at(g + 1, i, 0);
+      for (int d = 0; d < DIRECTIONS; ++d) {
+        if (n.neighbours[at(d)] != Grid::COARSER) continue;
+        const IntVec o = direction_offset(d);
+        IntVec lo{}, size{};
+        for (int a = 0; a < DIM; ++a) {
+          lo[a] = o[a] < 0 ? -Layout::GHOSTS : o[a] > 0 ? layout.n : 0;
+          size[a] = o[a] == 0 ? layout.n : Layout::GHOSTS;
+        }
+        amr::for_each_cell(lo, size, [&](const IntVec& c) {
+          IntVec near = c;
+          for (int& k : near) k = std::clamp(k, 0, layout.n - 1);
+          nu[layout.offset(c)] = nu[layout.offset(near)];
+        });
+      }
+      for (int a = 0; a < DIM; ++a)
+        for (int e = a + 1; e < DIM; ++e) {
+          double* edge = viscosity_.at(g + 1, i, edge_component(a, e));
+          const std::ptrdiff_t s = layout.stride(a), t = layout.stride(e);
+          amr::for_each_cell(filled(1 - Layout::GHOSTS), filled(layout.pitch() - 1), [&](const IntVec& c) {
+            const double* p = nu + layout.offset(c);
+            edge[layout.offset(c)] = 0.25 * ((p[0] + p[-s]) + (p[-t] + p[-s - t]));
+          });
+        }
+    });
+  }
+  set_up_pieces();
+}
+
+void StokesSolver::set_up_pieces() {
+  pieces_.first.assign(1, 0);
+  pieces_.weight.clear();
+  pieces_.comm = mesh_.comm();
+  const double finest = hierarchy_.grid(0).dx;
+  for (int b = 0; b < mesh_.size(); ++b) {
+    const auto [g, i] = hierarchy_.place_of_block(b);
+    const Layout& layout = hierarchy_.grid(g).layout;
+    const double dx = hierarchy_.grid(g).dx, cell = std::pow(dx / finest, DIM);
+    for (int c = 0; c <= DIM; ++c) {
+      const Range r = hierarchy_.unknowns(g, i, components_[at(c)], true);
+      const double* nu = viscosity_.at(g, i, 0);
+      amr::for_each_cell(r.lo, r.size, [&](const IntVec& q) {
+        const double p = dx / (2 * nu[layout.offset(q)]);  // a pressure as the velocity that it stands for
+        pieces_.weight.push_back(c < DIM ? cell : cell * p * p);
+      });
+    }
+    pieces_.first.push_back(static_cast<std::ptrdiff_t>(pieces_.weight.size()));
+  }
+}
+
+void StokesSolver::pack(const HierarchyField& f, Vector& v) const {
+  v.resize(pieces_.size());
+  for_leaves([&](int b, int g, int i, double) {
+    double* p = v.data() + pieces_.first[at(b)];
+    const Layout& layout = hierarchy_.grid(g).layout;
+    for (int c = 0; c <= DIM; ++c) {
+      const Range r = hierarchy_.unknowns(g, i, components_[at(c)], true);
+      const double* x = f.at(g, i, c) + layout.offset(r.lo);
+      amr::for_each_row(r.size, [&](const IntVec& row) {
+        p = std::copy_n(x + layout.offset(row), r.size[0], p);
+      });
+    }
+  });
+}
+
+void StokesSolver::unpack(const Vector& v, HierarchyField& f) const {
+  for_leaves([&](int b, int g, int i, double) {
+    const double* p = v.data() + pieces_.first[at(b)];
+    const Layout& layout = hierarchy_.grid(g).layout;
+    for (int c = 0; c <= DIM; ++c) {
+      const Range r = hierarchy_.unknowns(g, i, components_[at(c)], true);
+      double* x = f.at(g, i, c) + layout.offset(r.lo);
+      amr::for_each_row(r.size, [&](const IntVec& row) {
+        std::copy_n(p, r.size[0], x + layout.offset(row));
+        p += r.size[0];
+      });
+    }
+  });
+}
+
+// y = K x, or b - K x, on the leaves' unknowns. Ghosts of x are filled.
+void StokesSolver::apply(const HierarchyField& x, const HierarchyField* b, HierarchyField& y) const {
+  const bool symmetric = options_.stress == Stress::symmetric;
+  for_leaves([&](int, int g, int i, double dx) {
+    const Layout& layout = hierarchy_.grid(g).layout;
+    const double h = 1 / dx, h2 = h * h;
+    const double* nu = viscosity_.at(g, i, 0);
+    const double* p = x.at(g, i, PRESSURE);
+    for (int a = 0; a < DIM; ++a) {
+      const std::ptrdiff_t s = layout.stride(a);
+      const double* v = x.at(g, i, a);
+      double* out = y.at(g, i, a);
+      const double twice = symmetric ? 2 * h2 : h2;
+      const Range r = hierarchy_.unknowns(g, i, components_[at(a)], true);
+      const std::ptrdiff_t start = layout.offset(r.lo);
+      amr::for_each_row(r.size, [&](const IntVec& row) {
+        const std::ptrdiff_t q0 = start + layout.offset(row);
+#pragma omp simd
+        for (std::ptrdiff_t q = q0; q < q0 + r.size[0]; ++q)
+          out[q] = sigma_ * v[q] - twice * (nu[q] * (v[q + s] - v[q]) - nu[q - s] * (v[q] - v[q - s])) + h * (p[q] - p[q - s]);
+        for (int e = 0; e < DIM; ++e) {
+          if (e == a) continue;
+          const std::ptrdiff_t t = layout.stride(e);
+          const double* edge = viscosity_.at(g, i, edge_component(a, e));
+          if (symmetric) {
+            const double* u = x.at(g, i, e);
+#pragma omp simd
+            for (std::ptrdiff_t q = q0; q < q0 + r.size[0]; ++q)
+              out[q] -= h2 * (edge[q + t] * ((v[q + t] - v[q]) + (u[q + t] - u[q + t - s])) -
+                              edge[q] * ((v[q] - v[q - t]) + (u[q] - u[q - s])));
+          } else {
+#pragma omp simd
+            for (std::ptrdiff_t q = q0; q < q0 + r.size[0]; ++q)
+              out[q] -= h2 * (edge[q + t] * (v[q + t] - v[q]) - edge[q] * (v[q] - v[q - t]));
+          }
+        }
+      });
+    }
+    double* div = y.at(g, i, PRESSURE);
+    amr::for_each_row(filled(layout.n), [&](const IntVec& row) {
+      const std::ptrdiff_t q0 = layout.offset(row);
+      for (std::ptrdiff_t q = q0; q < q0 + layout.n; ++q) {
+        double sum = 0;
+        for (int a = 0; a < DIM; ++a) {
+          const double* v = x.at(g, i, a) + q;
+          sum += v[layout.stride(a)] - v[0];
+        }
+        div[q] = h * sum;
+      }
+    });
+    if (b == nullptr) return;
+    for (int c = 0; c <= DIM; ++c) {
+      const Range r = hierarchy_.unknowns(g, i, components_[at(c)], true);
+      const double* f = b->at(g, i, c);
+      double* out = y.at(g, i, c);
+      amr::for_each_cell(r.lo, r.size, [&](const IntVec& q) {
+        const std::ptrdiff_t o = layout.offset(q);
+        out[o] = f[o] - out[o];
+      });
+    }
+  });
+}
+
+void StokesSolver::remove_mean_pressure(HierarchyField& f) const {
+  if (!closed_) return;
+  std::vector<double> sums(at(mesh_.size()));
+  double volume_of_box = 1;
+  const RealVec hi = mesh_.shape().hi();
+  for (int a = 0; a < DIM; ++a) volume_of_box *= hi[a] - mesh_.shape().lo[a];
+  for_leaves([&](int b, int g, int i, double dx) {
+    const Layout& layout = hierarchy_.grid(g).layout;
+    double sum = 0;
+    amr::for_each_cell({}, filled(layout.n), [&](const IntVec& q) { sum += f.at(g, i, PRESSURE)[layout.offset(q)]; });
+    sums[at(b)] = sum * std::pow(dx, DIM);
+  });
+  std::vector<amr::ExactSum> total(1);
+  for (const double s : sums) total[0].add(s);
+  const double mean = amr::exact_sums(total, mesh_.comm())[0] / volume_of_box;
+  for_leaves([&](int, int g, int i, double) {
+    const Layout& layout = hierarchy_.grid(g).layout;
+    amr::for_each_cell({}, filled(layout.n), [&](const IntVec& q) { f.at(g, i, PRESSURE)[layout.offset(q)] -= mean; });
+  });
+}
+
+// In place: pressure from the divergence, then velocities from what the pressure leaves of the momentum.
+void StokesSolver::precondition(HierarchyField& r) {
+  const IntVec whole = filled(mesh_.layout().n + 1);
+  if (sigma_ > 0) {
+    remove_mean_pressure(r);
+    for_leaves([&](int, int g, int i, double) {
+      amr::copy_box(pressure_cycle_->rhs().ref(g, i, 0), {}, std::as_const(r).ref(g, i, PRESSURE), {}, filled(mesh_.layout().n));
+    });
+    pressure_cycle_->cycle();
+  }
+  for_leaves([&](int, int g, int i, double) {
+    const Layout& layout = hierarchy_.grid(g).layout;
+    const double *nu = viscosity_.at(g, i, 0), *lap = pressure_cycle_->solution().at(g, i, 0), *d = r.at(g, i, PRESSURE);
+    double* p = pressure_.at(g, i, 0);
+    amr::for_each_cell({}, filled(layout.n), [&](const IntVec& q) {
+      const std::ptrdiff_t o = layout.offset(q);
+      p[o] = 2 * nu[o] * d[o] + (sigma_ > 0 ? sigma_ * lap[o] : 0.0);
+    });
+  });
+  hierarchy_.make_composite(pressure_, 1, true);
+  for_leaves([&](int, int g, int i, double dx) {
+    const Layout& layout = hierarchy_.grid(g).layout;
+    const double* p = pressure_.at(g, i, 0);
+    for (int a = 0; a < DIM; ++a) {
+      const Range u = hierarchy_.unknowns(g, i, components_[at(a)], true);
+      double* to = velocity_cycle_->rhs().at(g, i, a);
+      const double* from = r.at(g, i, a);
+      amr::for_each_cell({}, whole, [&](const IntVec& q) { to[layout.offset(q)] = 0; });
+      const std::ptrdiff_t s = layout.stride(a);
+      amr::for_each_cell(u.lo, u.size, [&](const IntVec& q) {
+        const std::ptrdiff_t o = layout.offset(q);
+        to[o] = from[o] - (p[o] - p[o - s]) / dx;
+      });
+    }
+  });
+  velocity_cycle_->cycle();
+  for_leaves([&](int, int g, int i, double) {
+    for (int a = 0; a < DIM; ++a)
+      amr::copy_box(r.ref(g, i, a), {}, std::as_const(velocity_cycle_->solution()).ref(g, i, a), {}, whole);
+    amr::copy_box(r.ref(g, i, PRESSURE), {}, std::as_const(pressure_).ref(g, i, 0), {}, filled(mesh_.layout().n));
+  });
+  remove_mean_pressure(r);
+}
+
+StokesResult StokesSolver::solve(double sigma) {
+  sigma_ = sigma;
+  velocity_cycle_->prepare(velocity_links(sigma));
+  Vector x;
+  pack(state_, x);
+  // The norm of the velocity alone: what the error of the solution is measured against.
+  Vector v_only(x.size());
+  const auto speed = [&](const Vector& now) {
+    std::copy(now.begin(), now.end(), v_only.begin());
+    for (int b = 0; b < mesh_.size(); ++b) {
+      const std::ptrdiff_t cells = volume(filled(mesh_.layout().n));
+      std::fill_n(v_only.begin() + (pieces_.first[at(b) + 1] - cells), cells, 0.0);
+    }
+    return pieces_.norm(v_only);
+  };
+  // From rest the first preconditioned residual is itself a guess of the solution.
+  const auto target = [&](const Vector& now, double residual) {
+    const double v = speed(now);
+    return options_.tolerance * (v > 0 ? v : residual);
+  };
+  amr::GmresOptions o;
+  o.max_iterations = options_.max_iterations;
+  const amr::GmresResult g = gmres_.solve(x, pieces_, o, target);
+  unpack(x, state_);
+  fill_state();
+  StokesResult result;
+  result.iterations = g.iterations;
+  result.converged = g.converged;
+  const double scale = speed(x);
+  result.error = scale > 0 ? g.residual / scale : g.residual;
+  double div = 0, fastest = 0;
+  for (int b = 0; b < mesh_.size(); ++b) {
+    const auto [gr, i] = hierarchy_.place_of_block(b);
+    const Layout& layout = hierarchy_.grid(gr).layout;
+    amr::for_each_cell({}, filled(layout.n), [&](const IntVec& q) {
+      double sum = 0;
+      for (int a = 0; a < DIM; ++a) {
+        const double* v = state_.at(gr, i, a) + layout.offset(q);
+        sum += v[layout.stride(a)] - v[0];
+        fastest = std::max(fastest, std::abs(v[0]));
+      }
+      div = std::max(div, std::abs(sum));
+    });
+  }
+  div = amr::global_max(div, mesh_.comm());
+  fastest = amr::global_max(fastest, mesh_.comm());
+  result.divergence_max = fastest > 0 ? div / fastest : div;
+  return result;
+}
+
+}  // namespace dendrift::physics
