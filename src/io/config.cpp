@@ -100,6 +100,11 @@ Schema::Place Schema::place_of(const std::string& key) const {
   return place;
 }
 
+InputError Schema::error(const std::string& key, std::string expected, std::string found) const {
+  const Place place = place_of(key);
+  return InputError({{place.where, key, std::move(expected), found.empty() ? place.found : std::move(found), ""}});
+}
+
 bool Checks::overridden(const std::string& key) const {
   const auto place = schema_.given_.find(key);
   return place != schema_.given_.end() && place->second.where == command_line;
