@@ -33,7 +33,7 @@ GRAINS = {2: ["time_s", "grain", "x_um", "y_um", "vx_um_s", "vy_um_s", "omega_ra
 FIELDS = {2: ["phi", "U", "c", "alpha", "velocity_x", "velocity_y", "pressure", "level", "rank", "grain"],
           3: ["phi", "U", "c", "alpha", "velocity_x", "velocity_y", "velocity_z", "pressure", "level", "rank", "grain"]}
 MANIFEST = ["version", "git_hash", "compiler", "flags", "ranks", "threads", "machine", "input", "start", "end",
-            "status", "wall_s", "wall_by_phase"]
+            "status", "exit_code", "message", "wall_s", "wall_by_phase"]
 KEYS = ["run.end_time_s", "run.max_steps", "run.wall_clock_limit_s", "output.dir", "output.plot_every_s",
         "output.checkpoint_every_s", "mesh.dim"]  # those that scripts override
 
