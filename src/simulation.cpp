@@ -401,7 +401,7 @@ void Simulation::open_output() {
         // Checkpoints from before the restart count as well. Later ones belong to a course that is given up.
         for (const std::string& name : io::list_checkpoints(settings_.output.dir)) saved_.push_back(path(name));
         const auto later = [&](const std::string& file) { return file.size() > own.size() || file > own; };
-        std::ranges::stable_partition(saved_, later);
+        std::stable_partition(saved_.begin(), saved_.end(), later);
       } else {
         for (const auto& e : std::filesystem::directory_iterator(settings_.output.dir)) {
           const std::string name = e.path().filename().string();
