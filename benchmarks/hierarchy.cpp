@@ -17,18 +17,18 @@ namespace dendrift::bench {
 
 namespace {
 
-// One crystal: inputs/verification/al_cu_free.toml or al_cu_free_3d.toml. Many: more of them in the same box, whose
-// mesh no longer fits into a core's caches.
+// One crystal: inputs/verification/al_cu_free.toml or al_cu_free_3d.toml, in boxes whose finest cells are DX with blocks
+// of any size. Many: more of them in the same box, whose mesh no longer fits into a core's caches.
 enum class Crystals { one, many };
 
 std::string input(Crystals crystals) {
-  const int side = DIM == 2 ? 1000 : 128, across = crystals == Crystals::one ? 1 : DIM == 2 ? 6 : 2;
+  const double side = DIM == 2 ? 1024 : 102.4;
+  const int across = crystals == Crystals::one ? 1 : DIM == 2 ? 6 : 2;
   const auto vector = [](const std::array<double, 3>& x) {
     return DIM == 2 ? fmt::format("[{}, {}]", x[0], x[1]) : fmt::format("[{}, {}, {}]", x[0], x[1], x[2]);
   };
-  const double edge = side;
   std::string text = fmt::format("run.end_time_tau0 = 1000\nmesh.dim = {}\nmesh.size_W0 = {}\nmesh.dx_W0 = {}\n", DIM,
-                                 vector({edge, edge, edge}), DX);
+                                 vector({side, side, side}), DX);
   for (int f = 0; f < FACES; ++f) text += fmt::format("mesh.{}{} = \"symmetry\"\n", "xyz"[f / 2], f % 2 != 0 ? "hi" : "lo");
   const int count = static_cast<int>(std::pow(across, DIM));
   for (int i = 0; i < count; ++i) {
@@ -100,6 +100,7 @@ struct Run {
       ++kinds[static_cast<std::size_t>(physics::classify(mesh().cells(fields()[0], b), mesh().layout().n))];
     state.counters["stages"] = stages;
     state.counters["blocks"] = mesh().size();
+    state.counters["cells"] = cells();
     state.counters["interface_share"] = kinds[2] / mesh().size();
     state.counters["solid_share"] = kinds[1] / mesh().size();
     const auto& clock = simulation->clock().seconds();

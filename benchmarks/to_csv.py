@@ -2,14 +2,16 @@
 """to_csv.py RESULTS.json OUT.csv: the rows of dendrift-bench as a small table.
 
 One line a benchmark: median, min and max of its speed in Mcell updates a second and core, and, for paired rows, the
-median, min and max of the ratio of its time per update to that of the plain uniform loop.
+median, min and max of the ratio of its time per update to that of the plain uniform loop. Rows on a tree say
+how many cells the scene needs, and what one stage of them takes: cells / speed.
 """
 import csv
 import json
 import sys
 
-COLUMNS = ["name", "median_Mcell_per_s", "min_Mcell_per_s", "max_Mcell_per_s", "ratio", "ratio_min", "ratio_max",
-           "interface_share", "ghost_time_share", "machine", "commit", "date"]
+COLUMNS = ["name", "median_Mcell_per_s", "min_Mcell_per_s", "max_Mcell_per_s", "plain_Mcell_per_s", "ratio",
+           "ratio_min", "ratio_max", "cells", "blocks", "stages", "ms_per_stage", "interface_share", "ghost_time_share",
+           "regrid_time_share", "machine", "commit", "date"]
 
 
 def rows(results):
@@ -30,7 +32,9 @@ def rows(results):
             row["median_Mcell_per_s"] = speed
         else:
             continue
-        row.update({k: b[k] for k in COLUMNS if k in b})
+        row.update({k: b[k] for k in COLUMNS if k in b and k != "name"})
+        if "cells" in b:
+            row["ms_per_stage"] = b["cells"] / speed / 1e3
     return [{"name": name, **row} for name, row in table.items()]
 
 

@@ -39,7 +39,7 @@ int run(const CommandLine& command, bool root) {
 
   // 3. The run
   for (const int s : {SIGTERM, SIGINT, SIGUSR1}) std::signal(s, on_signal);
-  return simulation.run() == Outcome::stopped ? 75 : 0;
+  return simulation.run() == Outcome::stopped ? exit_code::stopped : exit_code::done;
 }
 
 }  // namespace
@@ -57,11 +57,11 @@ int main(int argc, char** argv) {
     const CommandLine command = parse_command_line(argc, argv, rank == 0);
     code = command.exit_code ? *command.exit_code : run(command, rank == 0);
   } catch (const io::InputError& e) {
-    fail(2, e.what());
+    fail(exit_code::bad_input, e.what());
   } catch (const NumericalError& e) {
-    fail(3, e.what());
+    fail(exit_code::numerical_failure, e.what());
   } catch (const io::OutputError& e) {
-    fail(4, e.what());
+    fail(exit_code::output_failure, e.what());
   } catch (const std::exception& e) {
     fail(1, fmt::format("rank {}: {}", rank, e.what()));
     MPI_Abort(MPI_COMM_WORLD, 1);  // one rank alone: the others would wait forever

@@ -1,5 +1,8 @@
 #include "settings.hpp"
 
+#include <fmt/format.h>
+#include <fmt/ranges.h>
+
 #include <algorithm>
 #include <array>
 #include <cmath>
@@ -17,6 +20,21 @@ void override_twin(const io::Checks& c, const std::string& a, std::optional<T>& 
                    std::optional<T>& y) {
   if (!x || !y || c.overridden(a) == c.overridden(b)) return;
   (c.overridden(a) ? y : x).reset();
+}
+
+// Every rank holds the whole tree, and root blocks are there from the start.
+void require_sane_tree(io::Checks& checks, const amr::MeshShape& shape, const MeshOptions& o) {
+  const std::string size = o.size_w0 ? "mesh.size_W0" : "mesh.size_um";
+  double blocks = 1;
+  for (const int r : shape.root_blocks) blocks *= r;
+  const std::string found = fmt::format("{} = {:.0f} root blocks, {} levels", fmt::join(shape.root_blocks, " x "), blocks,
+                                        shape.max_level + 1);
+  if (blocks > MOST_ROOT_BLOCKS)
+    checks.fail(o.root_blocks ? "mesh.root_blocks" : size,
+                fmt::format("at most {} root blocks; more levels give as fine cells with fewer", MOST_ROOT_BLOCKS), found);
+  if (!amr::Tree::fits(shape.root_blocks, shape.max_level))
+    checks.fail(o.root_blocks ? "mesh.levels" : size,
+                fmt::format("at most {} blocks along an axis on the finest level", amr::Tree::MOST_ALONG_AXIS), found);
 }
 
 }  // namespace
@@ -117,7 +135,7 @@ Settings::Settings() {
     RealVec size{};
     for (int a = 0; a < DIM; ++a) size[a] = mesh.size_w0 ? (*mesh.size_w0)[a] : (*mesh.size_um)[a] / s.w0_um;
     try {
-      choose_shape(size, mesh);
+      require_sane_tree(checks, choose_shape(size, mesh), mesh);
     } catch (const std::invalid_argument& e) {
       checks.fail("mesh", e.what(), "a box that does not fit");
     }
@@ -179,6 +197,10 @@ amr::MeshShape choose_shape(const RealVec& size, const MeshOptions& o) {
         throw std::invalid_argument("root_blocks in proportion to the sides of the box, so that cells are cubes");
     return shape;
   }
+  for (const double side : size)
+    if (side / (n * o.dx_w0) > static_cast<double>(amr::Tree::MOST_ALONG_AXIS))
+      throw std::invalid_argument(fmt::format("sides of at most {} blocks of {} cells of dx_W0 = {}",
+                                              amr::Tree::MOST_ALONG_AXIS, o.block_cells, o.dx_w0));
   // The tree of `level` refinements with the coarsest cells that are not above dx_w0; none if its blocks do not tile.
   const auto tree = [&](int level) -> std::optional<amr::MeshShape> {
     const double unit = n * static_cast<double>(1 << level);
@@ -187,8 +209,8 @@ amr::MeshShape choose_shape(const RealVec& size, const MeshOptions& o) {
       bool fits = true;
       for (int a = 0; a < DIM; ++a) {
         const double x = size[a] / size[0] * r;
-        fits = fits && near_integer(x) && std::round(x) >= 1;
-        shape.root_blocks[a] = static_cast<int>(std::round(x));
+        fits = fits && near_integer(x) && std::round(x) >= 1 && x <= static_cast<double>(amr::Tree::MOST_ALONG_AXIS);
+        if (fits) shape.root_blocks[a] = static_cast<int>(std::round(x));
       }
       if (!fits) continue;
       shape.max_level = level;

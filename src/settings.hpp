@@ -57,6 +57,8 @@ struct OutputOptions {
   void declare(io::Schema& schema);
 };
 
+inline constexpr std::int64_t MOST_ROOT_BLOCKS = 1'000'000;
+
 /// Declares every table on construction; parse() binds them. Throws io::InputError.
 class Settings {
  public:

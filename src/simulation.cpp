@@ -10,8 +10,8 @@
 
 #include "amr/comm.hpp"
 #include "io/hdf5.hpp"
-#include "io/manifest.hpp"
 #include "io/plotfile.hpp"
+#include "memory.hpp"
 #include "output.hpp"
 #include "physics/alloy_kernel.hpp"
 #include "physics/modules.hpp"
@@ -68,6 +68,7 @@ Simulation::Simulation(Settings& settings, MPI_Comm comm, const std::optional<st
   modules_ = physics::make_modules(settings, crystals_);
   amr::FieldTable fields;
   for (const auto& m : modules_) m->declare(fields);
+  require_memory(volume(settings.shape.root_blocks), fields);
   mesh_ = std::make_unique<amr::Mesh>(settings.shape, fields, comm);
   ghosts_ = std::make_unique<amr::GhostExchange>(*mesh_);
   psi_ = field("psi");
@@ -92,6 +93,19 @@ void Simulation::build_initial_mesh() {
   adapt(1.0);  // spread the final mesh by the partitioner of choice
   for (const auto& m : modules_) m->after_regrid();
   schedule_regrid();
+  starting_ = false;
+}
+
+void Simulation::require_memory(std::int64_t blocks, const amr::FieldTable& fields) const {
+  const Memory m = memory_of_mesh(blocks, fields, amr::Layout{settings_.shape.block_cells}, comm_);
+  if (m.enough()) return;
+  const std::string key = settings_.mesh.root_blocks ? "mesh.root_blocks"
+                          : settings_.mesh.size_w0   ? "mesh.size_W0"
+                                                     : "mesh.size_um";
+  throw settings_.schema.error(
+      key, fmt::format("a mesh that fits into the memory of a node, {:.3g} GB", 1e-9 * m.present),
+      fmt::format("{} blocks of {} cells a side at the start, that need {:.3g} GB on a node", blocks,
+                  settings_.shape.block_cells, 1e-9 * m.needed));
 }
 
 void Simulation::resume(const std::string& file) {
@@ -103,6 +117,7 @@ void Simulation::resume(const std::string& file) {
   };
   if (list("shape") != shape_numbers(settings_, crystals_.size()))
     throw io::OutputError(file, "restart", "the input describes another box, mesh, alloy or set of seeds than the checkpoint");
+  require_later_end(file, s);
   amr::Tree tree = mesh_->tree();
   try {
     tree = amr::Tree(settings_.shape.root_blocks, settings_.shape.periodic(), settings_.shape.max_level,
@@ -110,6 +125,7 @@ void Simulation::resume(const std::string& file) {
   } catch (const std::invalid_argument& e) {
     throw io::OutputError(file, "restart", e.what());
   }
+  require_memory(tree.size(), mesh_->fields());
   const std::vector<double> weights(at(tree.size()), 1.0);
   std::vector<int> owners = amr::partition(settings_.parallel.partitioner, tree, weights, mesh_->ranks());
   for (const amr::Block& b : mesh_->blocks()) mesh_->release_slot(b.slot);
@@ -135,7 +151,18 @@ void Simulation::resume(const std::string& file) {
     if (const auto memory = s.numbers.find(std::string("module.") + m->name()); memory != s.numbers.end())
       m->recall(memory->second);
   resumed_ = true;
+  starting_ = false;
   for (const auto& m : modules_) m->after_regrid();
+}
+
+void Simulation::require_later_end(const std::string& file, const io::RunState& s) const {
+  const double unit = settings_.run.end_time_s ? settings_.scales.tau0_s : 1;
+  if (settings_.end_time < s.time * (1 - DIAGNOSTICS_TOLERANCE))
+    throw settings_.schema.error(settings_.run.end_time_s ? "run.end_time_s" : "run.end_time_tau0",
+                                 fmt::format("at least {:.6g}, the time of {}", s.time * unit, file),
+                                 fmt::format("{:.6g}", settings_.end_time * unit));
+  if (settings_.run.max_steps < s.step)
+    throw settings_.schema.error("run.max_steps", fmt::format("at least {}, the step of {}", s.step, file));
 }
 
 io::RunState Simulation::state() const {
@@ -164,6 +191,7 @@ bool Simulation::adapt(double max_imbalance) {
     for (const auto& m : modules_) m->tag(b, tags[at(b)]);
   });
   const amr::Proposal proposal = amr::propose(*mesh_, tags);
+  if (starting_) require_memory(proposal.tree.size(), mesh_->fields());
   return amr::regrid(*mesh_, *ghosts_, proposal, {settings_.parallel.partitioner, max_imbalance});
 }
 
@@ -206,12 +234,20 @@ double Simulation::next_stop() const {
 }
 
 Outcome Simulation::run() {
-  open_output();
   try {
+    open_output();
     return run_to_end();
   } catch (const NumericalError& e) {
-    write_checkpoint(path(fmt::format("failed_{:07d}.h5", step_)));  // beside the good ones, not among them
-    write_manifest(std::string("failed: ") + e.what());
+    std::string message = e.what();
+    try {
+      write_checkpoint(path(fmt::format("failed_{:07d}.h5", step_)));  // beside the good ones, not among them
+    } catch (const io::OutputError& not_saved) {
+      message += fmt::format("; the state is lost: {}", not_saved.what());
+    }
+    record_failure(exit_code::numerical_failure, message);
+    throw NumericalError(message);
+  } catch (const io::OutputError& e) {
+    record_failure(exit_code::output_failure, e.what());
     throw;
   }
 }
@@ -255,7 +291,7 @@ Outcome Simulation::run_to_end() {
     const double limit = settings_.run.wall_clock_limit_s;
     if (amr::global_any(stop_requested != 0 || (limit > 0 && MPI_Wtime() - wall_start_ > limit), comm_)) {
       clock_.time("checkpoint", [&] { save(); });
-      write_manifest("stopped");
+      write_manifest("stopped", exit_code::stopped);
       return Outcome::stopped;
     }
     const double stop = next_stop();
@@ -264,7 +300,7 @@ Outcome Simulation::run_to_end() {
     step(dt);
     if (pieces == 1) time_ = stop;
   }
-  write_manifest("done");
+  write_manifest("done", exit_code::done);
   return Outcome::done;
 }
 
@@ -285,7 +321,7 @@ void Simulation::print_check() {
   fmt::print("output dir: {}\n", settings_.output.dir);
   fmt::print("c_l     {:.6g} wt%\nd0      {:.6g} um\nW0      {:.6g} um\ntau0    {:.6g} s\nlambda  {:.6g}\n",
              s.c_l_wt, s.d0_um, s.w0_um, s.tau0_s, s.lambda);
-  fmt::print("D       {:.6g} W0^2/tau0\ndt      {:.4g} tau0 = {:.4g} s\n", s.diffusivity, dt, dt * s.tau0_s);
+  fmt::print("D       {:.6g} W0^2/tau0\nnu      {:.6g} W0^2/tau0\ndt      {:.4g} tau0 = {:.4g} s\n", s.diffusivity, s.viscosity, dt, dt * s.tau0_s);
   fmt::print("end     {:.6g} tau0 = {:.6g} s\n", settings_.end_time, settings_.end_time * s.tau0_s);
   fmt::print("box    ");
   for (int a = 0; a < DIM; ++a) fmt::print(" {:.6g}", mesh_->shape().hi()[a]);
@@ -365,8 +401,13 @@ void Simulation::open_output() {
       const double now = time_ * settings_.scales.tau0_s;
       if (resumed_) {
         grains_csv_ = std::make_unique<io::CsvFile>(path("grains.csv"), grains, "time_s", now);
+        const std::string own = checkpoint_name();
         diagnostics_csv_ = std::make_unique<io::CsvFile>(path("diagnostics.csv"), diagnostics, "time_s", now);
         tips_csv_ = std::make_unique<io::CsvFile>(path("tips.csv"), tips, "time_s", now);
+        // Checkpoints from before the restart count as well. Later ones belong to a course that is given up.
+        for (const std::string& name : io::list_checkpoints(settings_.output.dir)) saved_.push_back(path(name));
+        const auto later = [&](const std::string& file) { return file.size() > own.size() || file > own; };
+        std::stable_partition(saved_.begin(), saved_.end(), later);
       } else {
         for (const auto& e : std::filesystem::directory_iterator(settings_.output.dir)) {
           const std::string name = e.path().filename().string();
@@ -499,18 +540,36 @@ void Simulation::write_plotfile() {
 
 void Simulation::write_checkpoint(const std::string& file) { io::write_checkpoint(file, *mesh_, state()); }
 
+std::string Simulation::checkpoint_name() const { return path(fmt::format("chk_{:07d}.h5", step_)); }
+
 void Simulation::save() {
-  const std::string file = path(fmt::format("chk_{:07d}.h5", step_));
+  const std::string file = checkpoint_name();
   write_checkpoint(file);
-  saved_.erase(std::remove(saved_.begin(), saved_.end(), file), saved_.end());
+  if (mesh_->rank() != 0) return;
+  std::erase(saved_, file);
   saved_.push_back(file);
   while (saved_.size() > at(settings_.output.keep_checkpoints)) {
-    if (mesh_->rank() == 0) std::filesystem::remove(saved_.front());
+    io::remove_quietly(saved_.front());
     saved_.erase(saved_.begin());
   }
 }
 
-void Simulation::write_manifest(const std::string& status) {
+io::Manifest Simulation::manifest(const std::string& status, const std::map<std::string, double>& phases) const {
+  io::Manifest m;
+  m.status = status;
+  m.started = started_;
+  m.ranks = mesh_->ranks();
+  m.input = settings_.schema.resolved_toml();
+  m.time_s = time_ * settings_.scales.tau0_s;
+  m.steps = step_;
+  m.wall_s = MPI_Wtime() - wall_start_;
+  m.phases = phases;
+  m.blocks = mesh_->tree().size();
+  m.block_cells = mesh_->layout().n;
+  return m;
+}
+
+void Simulation::write_manifest(const std::string& status, std::optional<int> exit_code) {
   std::map<std::string, double> phases = clock_.seconds();
   phases["ghost_fill"] = ghosts_->fill_seconds();
   phases["ghost_wait"] = ghosts_->wait_seconds();
@@ -523,20 +582,23 @@ void Simulation::write_manifest(const std::string& status) {
   io::SharedFailure failure;
   if (mesh_->rank() == 0)
     failure.attempt(path("manifest.json"), "write the manifest", [&] {
-      io::Manifest m;
-      m.status = status;
-      m.started = started_;
-      m.ranks = mesh_->ranks();
-      m.input = settings_.schema.resolved_toml();
-      m.time_s = time_ * settings_.scales.tau0_s;
-      m.steps = step_;
-      m.wall_s = MPI_Wtime() - wall_start_;
-      m.phases = phases;
-      m.blocks = mesh_->tree().size();
-      m.block_cells = mesh_->layout().n;
+      io::Manifest m = manifest(status, phases);
+      m.exit_code = exit_code;
       io::write_manifest(path("manifest.json"), m);
     });
   failure.agree(comm_);
+}
+
+void Simulation::record_failure(int exit_code, const std::string& message) const {
+  if (mesh_->rank() != 0) return;  // no messages between ranks once something has failed: times are those of this rank
+  try {
+    io::Manifest m = manifest("failed", clock_.seconds());
+    m.exit_code = exit_code;
+    m.message = message;
+    io::write_manifest(path("manifest.json"), m);
+  } catch (const io::OutputError&) {
+    // The folder cannot be written, which is what the message says in most cases.
+  }
 }
 
 void Simulation::progress(const Totals& t, double dt, bool last) {

@@ -13,6 +13,7 @@
 #include "io/checkpoint.hpp"
 #include "io/diagnostics.hpp"
 #include "io/hdf5.hpp"
+#include "io/manifest.hpp"
 #include "physics/crystals.hpp"
 #include "physics/module.hpp"
 #include "settings.hpp"
@@ -50,6 +51,11 @@ struct Totals {
 
 enum class Outcome { done, stopped };
 
+/// What the program ends with, apart from 1 (unexpected).
+namespace exit_code {
+inline constexpr int done = 0, bad_input = 2, numerical_failure = 3, output_failure = 4, stopped = 75;
+}
+
 class Simulation {
  public:
   /// Builds the mesh and the initial state, or reads it from a checkpoint. Nothing is written. Collective.
@@ -82,7 +88,9 @@ class Simulation {
 
  private:
   void build_initial_mesh();
+  void require_memory(std::int64_t blocks, const amr::FieldTable& fields) const;
   void resume(const std::string& path);
+  void require_later_end(const std::string& file, const io::RunState& s) const;
   bool adapt(double max_imbalance);
   void schedule_regrid();
   double next_stop() const;
@@ -95,8 +103,11 @@ class Simulation {
   void write_grains(io::SharedFailure& failure);
   void write_plotfile();
   void save();
-  void write_manifest(const std::string& status);
+  io::Manifest manifest(const std::string& status, const std::map<std::string, double>& phases) const;
+  void write_manifest(const std::string& status, std::optional<int> exit_code = std::nullopt);
+  void record_failure(int exit_code, const std::string& message) const;  // not collective, throws nothing of its own
   void progress(const Totals& t, double dt, bool last);
+  std::string checkpoint_name() const;
   std::string path(const std::string& name) const { return settings_.output.dir + "/" + name; }
   io::RunState state() const;
 
@@ -114,9 +125,9 @@ class Simulation {
   double initial_solute_ = 0;
   std::map<std::string, std::vector<double>> last_tips_;  // "grain.arm" -> time, length
   std::int64_t last_line_step_ = -1;
-  bool resumed_ = false;
+  bool resumed_ = false, starting_ = true;
   std::unique_ptr<io::CsvFile> diagnostics_csv_, tips_csv_, grains_csv_;
-  std::vector<std::string> saved_;
+  std::vector<std::string> saved_;  // rank 0: checkpoints in the folder, the next to be removed first
   PhaseClock clock_;
   double wall_start_ = 0, last_progress_ = 0;
   std::string started_;

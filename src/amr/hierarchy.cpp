@@ -36,26 +36,58 @@ int towards(int axis, int step) {
   return direction_index(o);
 }
 
-// Linear value at a fine place.
-double interpolate_linear(const ArrayRef<const double>& c, const IntVec& fine, int normal) {
-  double sum = 0;
-  for (int corner = 0; corner < CHILDREN; ++corner) {
-    double w = 1;
-    IntVec at{};
-    for (int a = 0; a < DIM; ++a) {
-      const bool far = (corner >> a & 1) != 0, odd = (fine[a] & 1) != 0;
-      at[a] = fine[a] >> 1;
-      if (a == normal) {
-        w *= odd ? 0.5 : far ? 0.0 : 1.0;
-        if (far) ++at[a];
-      } else {
-        w *= far ? 0.25 : 0.75;
-        if (far) at[a] += odd ? 1 : -1;
+// Adds the linear interpolation of a coarse array to a fine one: a line of coarse values for every fine row, weighted
+// 3:1 across rows of cells and 1:1 between planes of faces, then the same along the row.
+void add_linear(const ArrayRef<double>& x, const ArrayRef<const double>& coarse, const Range& box, int normal, int n) {
+  std::array<double, 64> line_array{};
+  double* line = line_array.data() + 2;  // coarse cells -1 to n/2 + 1
+  const int half = n / 2;
+  for_each_row(box.size, [&](const IntVec& row) {
+    constexpr int CORNERS = CHILDREN / 2;
+    std::array<double, CORNERS> weight{};
+    std::array<const double*, CORNERS> from{};
+    for (int corner = 0; corner < CORNERS; ++corner) {
+      double w = 1;
+      const double* p = coarse.p;
+      for (int a = 1; a < DIM; ++a) {
+        const int fine = box.lo[a] + row[a], odd = fine & 1;
+        const bool far = (corner >> (a - 1) & 1) != 0;
+        int place = fine >> 1;
+        if (a == normal) {
+          w *= odd != 0 ? 0.5 : far ? 0.0 : 1.0;
+          if (far && odd != 0) ++place;
+        } else {
+          w *= far ? 0.25 : 0.75;
+          if (far) place += odd != 0 ? 1 : -1;
+        }
+        p += place * coarse.stride[a];
+      }
+      weight[static_cast<std::size_t>(corner)] = w;
+      from[static_cast<std::size_t>(corner)] = p;
+    }
+    for (int i = -1; i <= half; ++i) {
+      double sum = 0;
+      for (std::size_t corner = 0; corner < CORNERS; ++corner) sum += weight[corner] * from[corner][i];
+      line[i] = sum;
+    }
+    IntVec start = row;
+    for (int a = 0; a < DIM; ++a) start[a] += box.lo[a];
+    start[0] = 0;
+    double* out = x.at(start);
+    const int last = box.lo[0] + box.size[0] - 1;
+    if (normal == 0) {
+      for (int i = 0; i < half; ++i) {
+        if (2 * i >= box.lo[0]) out[2 * i] += line[i];
+        out[2 * i + 1] += 0.5 * (line[i] + line[i + 1]);
+      }
+      if (last == n) out[n] += line[half];
+    } else {
+      for (int i = 0; i < half; ++i) {
+        out[2 * i] += 0.75 * line[i] + 0.25 * line[i - 1];
+        out[2 * i + 1] += 0.75 * line[i] + 0.25 * line[i + 1];
       }
     }
-    if (w != 0) sum += w * *c.at(at);
-  }
-  return sum;
+  });
 }
 
 }  // namespace
@@ -215,8 +247,8 @@ void Hierarchy::build_routes(int g) {
         const Grid::Node &to_node = grid.nodes[i], &from_node = grid.nodes[at(from)];
         if (to_node.owner != rank_ && from_node.owner != rank_) continue;
         // The tag names the destination as well: its surroundings decide how much is copied.
-        emit(Item{static_cast<int>(i), from_node.local, d, static_cast<int>(i) * DIRECTIONS + d}, to_node.owner,
-             from_node.owner);
+        emit(Item{static_cast<int>(i), from_node.local, d, static_cast<int>(i) * DIRECTIONS + d, ghost_boxes(grid, to_node, d)},
+             to_node.owner, from_node.owner);
       }
   });
   if (g + 1 == grids()) return;
@@ -224,13 +256,20 @@ void Hierarchy::build_routes(int g) {
   r.from_parent = make_route([&](auto&& emit) {
     for (std::size_t i = 0; i < grid.nodes.size(); ++i) {
       const Grid::Node &n = grid.nodes[i], &p = coarse.nodes[at(n.parent)];
-      emit(Item{static_cast<int>(i), p.local, 0, static_cast<int>(i)}, n.owner, p.owner);
+      emit(Item{static_cast<int>(i), p.local, 0, static_cast<int>(i), {}}, n.owner, p.owner);
+    }
+  });
+  r.ghosts_from_parent = make_route([&](auto&& emit) {
+    for (std::size_t i = 0; i < grid.nodes.size(); ++i) {
+      const Grid::Node &n = grid.nodes[i], &p = coarse.nodes[at(n.parent)];
+      if (std::find(n.neighbours.begin(), n.neighbours.end(), Grid::COARSER) == n.neighbours.end()) continue;
+      emit(Item{static_cast<int>(i), p.local, 0, static_cast<int>(i), {}}, n.owner, p.owner);
     }
   });
   r.to_parent = make_route([&](auto&& emit) {
     for (std::size_t i = 0; i < grid.nodes.size(); ++i) {
       const Grid::Node &n = grid.nodes[i], &p = coarse.nodes[at(n.parent)];
-      emit(Item{p.local, static_cast<int>(i), 0, static_cast<int>(i)}, p.owner, n.owner);
+      emit(Item{p.local, static_cast<int>(i), 0, static_cast<int>(i), {}}, p.owner, n.owner);
     }
   });
   // The high faces of a node that has a coarser leaf beyond are the low faces of that leaf.
@@ -241,7 +280,7 @@ void Hierarchy::build_routes(int g) {
         if (n.neighbours[at(towards(a, 1))] != Grid::COARSER) continue;
         const int beyond = coarse.nodes[at(n.parent)].neighbours[at(towards(a, 1))];
         const Grid::Node& q = coarse.nodes[at(beyond)];
-        emit(Item{q.local, static_cast<int>(i), a, static_cast<int>(i) * DIM + a}, q.owner, n.owner);
+        emit(Item{q.local, static_cast<int>(i), a, static_cast<int>(i) * DIM + a, {}}, q.owner, n.owner);
       }
   });
 }
@@ -298,14 +337,14 @@ Range Hierarchy::unknowns(int g, int i, const Component& c, bool composite) cons
 
 // Ghosts of a node in one direction. A plane of faces on the far side of the box belongs to it unless another node
 // of this grid lies there and owns it.
-Range Hierarchy::ghost_box(const Grid& grid, const Grid::Node& n, int direction, const Component& c, int depth) const {
+Range Hierarchy::ghost_box(const Grid& grid, const Grid::Node& n, int direction, int normal, int depth) const {
   const IntVec o = direction_offset(direction);
   const int cells = grid.layout.n;
   Range r;
   for (int a = 0; a < DIM; ++a) {
     r.lo[a] = o[a] < 0 ? -depth : o[a] > 0 ? cells : 0;
     r.size[a] = o[a] == 0 ? cells : depth;
-    if (a != c.normal) continue;
+    if (a != normal) continue;
     if (o[a] == 0) {
       IntVec beyond = o;
       beyond[a] = 1;
@@ -317,17 +356,24 @@ Range Hierarchy::ghost_box(const Grid& grid, const Grid::Node& n, int direction,
   return r;
 }
 
+Hierarchy::GhostBoxes Hierarchy::ghost_boxes(const Grid& grid, const Grid::Node& n, int direction) const {
+  GhostBoxes boxes;
+  const IntVec o = direction_offset(direction);
+  for (int normal = -1; normal < DIM; ++normal)
+    for (int depth = 1; depth <= G; ++depth) {
+      const Range r = ghost_box(grid, n, direction, normal, depth);
+      IntVec from = r.lo;
+      for (int a = 0; a < DIM; ++a) from[a] -= o[a] * grid.layout.n;
+      boxes.of[at((normal + 1) * G + depth - 1)] = {grid.layout.offset(r.lo), grid.layout.offset(from), r.size};
+    }
+  return boxes;
+}
+
 void Hierarchy::exchange(HierarchyField& f, int g, int depth, bool homogeneous) {
   const Grid& gr = grid(g);
+  const Layout& layout = gr.layout;
   const int nc = f.components();
-  const auto box = [&](const Item& item, int c) {
-    return ghost_box(gr, gr.nodes[at(item.dst)], item.tag, f.component(c), depth);
-  };
-  const auto shifted = [&](IntVec lo, int d) {
-    const IntVec o = direction_offset(d);
-    for (int a = 0; a < DIM; ++a) lo[a] -= o[a] * gr.layout.n;
-    return lo;
-  };
+  const auto box = [&](const Item& item, int c) -> const GhostCopy& { return item.boxes.at(f.component(c).normal, depth); };
   run(
       routes_[at(g)].same,
       [&](const Item& item) {
@@ -337,23 +383,30 @@ void Hierarchy::exchange(HierarchyField& f, int g, int depth, bool homogeneous) 
       },
       [&](const Item& item, double* p) {
         for (int c = 0; c < nc; ++c) {
-          const Range r = box(item, c);
-          copy_box(packed_ref(p, r.size), {}, std::as_const(f).ref(g, item.src, c), shifted(r.lo, item.tag), r.size);
-          p += volume(r.size);
+          const GhostCopy& k = box(item, c);
+          const double* src = f.at(g, item.src, c) + k.src;
+          for_each_row(k.size, [&](const IntVec& row) { p = std::copy_n(src + layout.offset(row), k.size[0], p); });
         }
       },
       [&](const Item& item, const double* p) {
         for (int c = 0; c < nc; ++c) {
-          const Range r = box(item, c);
-          copy_box(f.ref(g, gr.nodes[at(item.dst)].local, c), r.lo, packed_ref(p, r.size), {}, r.size);
-          p += volume(r.size);
+          const GhostCopy& k = box(item, c);
+          double* dst = f.at(g, gr.nodes[at(item.dst)].local, c) + k.dst;
+          for_each_row(k.size, [&](const IntVec& row) {
+            std::copy_n(p, k.size[0], dst + layout.offset(row));
+            p += k.size[0];
+          });
         }
       },
       [&](const Item& item) {
         for (int c = 0; c < nc; ++c) {
-          const Range r = box(item, c);
-          copy_box(f.ref(g, gr.nodes[at(item.dst)].local, c), r.lo, std::as_const(f).ref(g, item.src, c),
-                   shifted(r.lo, item.tag), r.size);
+          const GhostCopy& k = box(item, c);
+          double* dst = f.at(g, gr.nodes[at(item.dst)].local, c) + k.dst;
+          const double* src = f.at(g, item.src, c) + k.src;
+          for_each_row(k.size, [&](const IntVec& row) {
+            const std::ptrdiff_t o = layout.offset(row);
+            for (int i = 0; i < k.size[0]; ++i) dst[o + i] = src[o + i];
+          });
         }
       });
   parallel_for(gr.size(), [&](int i) { apply_sides(f, g, i, depth, homogeneous); });
@@ -400,76 +453,75 @@ void Hierarchy::apply_sides(HierarchyField& f, int g, int i, int depth, bool hom
 
 // use(local node, parents): parents[c] is the array of the parent, shifted so that its cell 0 holds the node's.
 template <class F>
-void Hierarchy::with_parents(HierarchyField& f, int g, F&& use) {
+void Hierarchy::with_parents(HierarchyField& f, int g, Route& route, F&& use) {
   const Grid& gr = grid(g);
   const int nc = f.components();
   const IntVec size = filled(gr.layout.n / 2 + 2 * G);
-  using Refs = std::vector<ArrayRef<const double>>;
   const auto patch = [&](int src, const Grid::Node& n, int c) {
     ArrayRef<const double> r = std::as_const(f).ref(g + 1, src, c);
     r.p = r.at(n.place);
     return r;
   };
   run(
-      routes_[at(g)].from_parent, [&](const Item&) { return nc * volume(size); },
+      route, [&](const Item&) { return nc * volume(size); },
       [&](const Item& item, double* p) {
         for (int c = 0; c < nc; ++c, p += volume(size))
           copy_box(packed_ref(p, size), {}, patch(item.src, gr.nodes[at(item.dst)], c), filled(-G), size);
       },
       [&](const Item& item, const double* p) {
-        Refs refs;
+        Parents parents{};
         for (int c = 0; c < nc; ++c) {
-          ArrayRef<const double> r = packed_ref(p + c * volume(size), size);
-          r.p = r.at(filled(G));
-          refs.push_back(r);
+          parents[at(c)] = packed_ref(p + c * volume(size), size);
+          parents[at(c)].p = parents[at(c)].at(filled(G));
         }
-        use(gr.nodes[at(item.dst)].local, refs);
+        use(gr.nodes[at(item.dst)].local, parents);
       },
       [&](const Item& item) {
-        Refs refs;
-        for (int c = 0; c < nc; ++c) refs.push_back(patch(item.src, gr.nodes[at(item.dst)], c));
-        use(gr.nodes[at(item.dst)].local, refs);
+        Parents parents{};
+        for (int c = 0; c < nc; ++c) parents[at(c)] = patch(item.src, gr.nodes[at(item.dst)], c);
+        use(gr.nodes[at(item.dst)].local, parents);
       });
+}
+
+void Hierarchy::fill_coarse_ghosts(HierarchyField& f, int g, int i, const Parents& parents) const {
+  const Grid& gr = grid(g);
+  const Grid::Node& n = gr.mine(i);
+  for (int d = 0; d < DIRECTIONS; ++d) {
+    if (n.neighbours[at(d)] != Grid::COARSER) continue;
+    const IntVec o = direction_offset(d);
+    for (int c = 0; c < f.components(); ++c) {
+      const int a = f.component(c).normal;
+      Range r;
+      for (int b = 0; b < DIM; ++b) {
+        r.lo[b] = o[b] < 0 ? -G : o[b] > 0 ? gr.layout.n : 0;
+        r.size[b] = o[b] == 0 ? gr.layout.n : G;
+      }
+      if (a >= 0 && d == towards(a, 1)) {  // the plane at the side is the node's own
+        ++r.lo[a];
+        --r.size[a];
+      } else if (a >= 0 && o[a] == 0) {
+        IntVec beyond = o;
+        beyond[a] = 1;
+        if (n.neighbours[at(direction_index(beyond))] < 0) ++r.size[a];
+      }
+      const ArrayRef<double> x = f.ref(g, i, c);
+      for_each_cell(r.lo, r.size, [&](const IntVec& q) { *x.at(q) = fine_value(parents[at(c)], q, a, gr.layout.n); });
+    }
+  }
 }
 
 void Hierarchy::fill_from_coarser(HierarchyField& f, int g) {
   if (g + 1 >= levels_) return;
-  const Grid& gr = grid(g);
-  with_parents(f, g, [&](int i, const std::vector<ArrayRef<const double>>& parents) {
-    const Grid::Node& n = gr.mine(i);
-    for (int d = 0; d < DIRECTIONS; ++d) {
-      if (n.neighbours[at(d)] != Grid::COARSER) continue;
-      const IntVec o = direction_offset(d);
-      for (int c = 0; c < f.components(); ++c) {
-        const int a = f.component(c).normal;
-        Range r;
-        for (int b = 0; b < DIM; ++b) {
-          r.lo[b] = o[b] < 0 ? -G : o[b] > 0 ? gr.layout.n : 0;
-          r.size[b] = o[b] == 0 ? gr.layout.n : G;
-        }
-        if (d == towards(std::max(a, 0), 1) && a >= 0) {  // the plane at the side is the node's own
-          ++r.lo[a];
-          --r.size[a];
-        } else if (a >= 0 && o[a] == 0 && n.neighbours[at(towards(a, 1))] < 0) {
-          ++r.size[a];
-        }
-        const ArrayRef<double> x = f.ref(g, i, c);
-        for_each_cell(r.lo, r.size, [&](const IntVec& q) { *x.at(q) = fine_value(parents[at(c)], q, a, gr.layout.n); });
-      }
-    }
-  });
+  with_parents(f, g, routes_[at(g)].ghosts_from_parent,
+               [&](int i, const Parents& parents) { fill_coarse_ghosts(f, g, i, parents); });
 }
 
 void Hierarchy::prolong_add(HierarchyField& f, int g) {
-  with_parents(f, g, [&](int i, const std::vector<ArrayRef<const double>>& parents) {
-    for (int c = 0; c < f.components(); ++c) {
-      const Range r = unknowns(g, i, f.component(c), false);
-      const ArrayRef<double> x = f.ref(g, i, c);
-      const int a = f.component(c).normal;
-      for_each_cell(r.lo, r.size, [&](const IntVec& q) { *x.at(q) += interpolate_linear(parents[at(c)], q, a); });
-    }
+  with_parents(f, g, routes_[at(g)].from_parent, [&](int i, const Parents& parents) {
+    for (int c = 0; c < f.components(); ++c)
+      add_linear(f.ref(g, i, c), parents[at(c)], unknowns(g, i, f.component(c), false), f.component(c).normal, grid(g).layout.n);
+    fill_coarse_ghosts(f, g, i, parents);
   });
-  fill_from_coarser(f, g);
 }
 
 // value(array, place in the finer grid, normal, below, above): what a coarse cell or face receives from the fine ones

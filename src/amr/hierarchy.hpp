@@ -53,7 +53,7 @@ struct Grid {
 
 class Hierarchy;
 
-/// Arrays of some components on all of this rank's nodes.
+/// Arrays of up to DIM + 1 components on all of this rank's nodes.
 class HierarchyField {
  public:
   HierarchyField() = default;
@@ -118,10 +118,21 @@ class Hierarchy {
   void make_composite(HierarchyField& f, int depth, bool homogeneous);
 
  private:
+  // A box of ghosts in arrays of one layout, and where it comes from in the source's array.
+  struct GhostCopy {
+    std::ptrdiff_t dst = 0, src = 0;
+    IntVec size{};
+  };
+  static constexpr int BOXES = (DIM + 1) * Layout::GHOSTS;  // by normal and depth
+  struct GhostBoxes {
+    std::array<GhostCopy, BOXES> of;
+    const GhostCopy& at(int normal, int depth) const { return of[static_cast<std::size_t>((normal + 1) * Layout::GHOSTS + depth - 1)]; }
+  };
   struct Item {
     int dst, src;  // nodes; local numbers where they are ours
     int tag;
     int order;     // agreed on by both sides
+    GhostBoxes boxes;  // of Routes::same
   };
   struct Message {
     int rank = 0;
@@ -133,9 +144,8 @@ class Hierarchy {
     std::vector<Message> messages;
   };
   struct Routes {
-    Route same, from_parent, to_parent, to_plane;
+    Route same, from_parent, ghosts_from_parent, to_parent, to_plane;
   };
-
   void add_level_grids();
   void add_grids_beneath();
   void connect(int g);
@@ -145,10 +155,13 @@ class Hierarchy {
   template <class Size, class Pack, class Unpack, class Direct>
   void run(Route& r, Size&& size, Pack&& pack, Unpack&& unpack, Direct&& direct);
   template <class F>
-  void with_parents(HierarchyField& f, int g, F&& use);
+  void with_parents(HierarchyField& f, int g, Route& route, F&& use);
+  using Parents = std::array<ArrayRef<const double>, DIM + 1>;
+  void fill_coarse_ghosts(HierarchyField& f, int g, int i, const Parents& parents) const;
+  GhostBoxes ghost_boxes(const Grid& grid, const Grid::Node& n, int direction) const;
   template <class PlaneValue>
   void restrict_by(const HierarchyField& from, HierarchyField& to, int g, PlaneValue&& value);
-  Range ghost_box(const Grid& grid, const Grid::Node& n, int direction, const Component& c, int depth) const;
+  Range ghost_box(const Grid& grid, const Grid::Node& n, int direction, int normal, int depth) const;
   void apply_sides(HierarchyField& f, int g, int i, int depth, bool homogeneous) const;
 
   const Mesh& mesh_;

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <stdexcept>
+#include <string>
 
 namespace dendrift::amr {
 
@@ -26,7 +27,15 @@ bool is_first_child(const BlockIndex& b) {
   return std::all_of(b.coord.begin(), b.coord.end(), [](int c) { return (c & 1) == 0; });
 }
 
-std::vector<BlockIndex> root_leaves(const IntVec& root) {
+void require_fit(const IntVec& root, int max_level) {
+  if (max_level < 0 || max_level > 20) throw std::invalid_argument("tree: max_level must be 0 to 20");
+  if (!Tree::fits(root, max_level))
+    throw std::invalid_argument("tree: more than " + std::to_string(Tree::MOST_ALONG_AXIS) +
+                                " blocks along an axis on the finest level");
+}
+
+std::vector<BlockIndex> root_leaves(const IntVec& root, int max_level) {
+  require_fit(root, max_level);
   std::vector<BlockIndex> leaves;
   for (std::int64_t i = 0; i < volume(root); ++i) {
     BlockIndex b;
@@ -42,12 +51,17 @@ std::vector<BlockIndex> root_leaves(const IntVec& root) {
 
 }  // namespace
 
+bool Tree::fits(const IntVec& root_blocks, int max_level) {
+  return std::all_of(root_blocks.begin(), root_blocks.end(),
+                     [&](int r) { return (std::int64_t{r} << max_level) <= MOST_ALONG_AXIS; });
+}
+
 Tree::Tree(IntVec root_blocks, Array<bool> periodic, int max_level)
-    : Tree(root_blocks, periodic, max_level, root_leaves(root_blocks)) {}
+    : Tree(root_blocks, periodic, max_level, root_leaves(root_blocks, max_level)) {}
 
 Tree::Tree(IntVec root_blocks, Array<bool> periodic, int max_level, std::vector<BlockIndex> leaves)
     : root_blocks_(root_blocks), periodic_(periodic), max_level_(max_level), leaves_(std::move(leaves)) {
-  if (max_level < 0 || max_level > 20) throw std::invalid_argument("tree: max_level must be 0 to 20");
+  require_fit(root_blocks_, max_level);
   for (const BlockIndex& b : leaves_) {
     BlockIndex inside_box = b;
     if (b.level < 0 || b.level > max_level_ || !inside(inside_box) || inside_box != b)

@@ -35,7 +35,11 @@ struct FinerNeighbour {
 /// result of this class, is the same on all ranks. Immutable: adapted() returns a new tree.
 class Tree {
  public:
-  /// All root blocks as leaves of level 0. max_level <= 20.
+  /// Blocks of the finest level that an axis can have: the sorting key of a leaf has 64 bits for all axes.
+  static constexpr std::int64_t MOST_ALONG_AXIS = std::int64_t{1} << (DIM == 2 ? 30 : 21);
+  static bool fits(const IntVec& root_blocks, int max_level);
+
+  /// All root blocks as leaves of level 0. max_level <= 20; throws std::invalid_argument where `fits` is false.
   Tree(IntVec root_blocks, Array<bool> periodic, int max_level);
   /// A given set of leaves (a restart); throws std::invalid_argument unless it tiles the domain and is balanced.
   Tree(IntVec root_blocks, Array<bool> periodic, int max_level, std::vector<BlockIndex> leaves);

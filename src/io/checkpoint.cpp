@@ -112,17 +112,22 @@ void write_checkpoint(const std::string& path, const amr::Mesh& mesh, const RunS
   failure.agree(mesh.comm());
 }
 
+std::vector<std::string> list_checkpoints(const std::string& dir) {
+  std::vector<std::string> names;
+  for (const fs::directory_entry& e : fs::directory_iterator(dir)) {
+    const std::string name = e.path().filename().string();
+    if (name.starts_with("chk_") && name.ends_with(".h5")) names.push_back(name);
+  }
+  std::ranges::sort(names, {}, [](const std::string& name) { return std::pair(name.size(), name); });
+  return names;
+}
+
 std::string find_checkpoint(const std::string& file_or_dir) {
   if (!fs::exists(file_or_dir)) throw OutputError(file_or_dir, "restart", "no such file or folder");
   if (!fs::is_directory(file_or_dir)) return file_or_dir;
-  std::string newest;
-  for (const fs::directory_entry& e : fs::directory_iterator(file_or_dir)) {
-    const std::string name = e.path().filename().string();
-    if (!name.starts_with("chk_") || !name.ends_with(".h5")) continue;
-    if (std::pair(name.size(), name) > std::pair(newest.size(), newest)) newest = name;  // by number
-  }
-  if (newest.empty()) throw OutputError(file_or_dir, "restart", "the folder holds no checkpoint (chk_*.h5)");
-  return (fs::path(file_or_dir) / newest).string();
+  const std::vector<std::string> names = list_checkpoints(file_or_dir);
+  if (names.empty()) throw OutputError(file_or_dir, "restart", "the folder holds no checkpoint (chk_*.h5)");
+  return (fs::path(file_or_dir) / names.back()).string();
 }
 
 RunState read_state(const std::string& path, MPI_Comm comm) {

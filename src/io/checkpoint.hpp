@@ -25,6 +25,9 @@ inline constexpr int CHECKPOINT_FORMAT = 1;
 /// Writes path + ".part", syncs, and renames. Collective; throws OutputError on every rank or none.
 void write_checkpoint(const std::string& path, const amr::Mesh& mesh, const RunState& state);
 
+/// Names of the chk_*.h5 of a folder, by number.
+std::vector<std::string> list_checkpoints(const std::string& dir);
+
 /// The newest chk_*.h5 of a folder, or the file itself. Throws OutputError if there is none.
 std::string find_checkpoint(const std::string& file_or_dir);
 

@@ -275,6 +275,8 @@ class Schema {
 
   bool has_table(const std::string& name) const { return given_.contains(name); }
   bool given(const std::string& key) const { return given_.contains(key); }  ///< "table.key", "list[i].key"
+  /// A problem with `key` that shows only after parsing, to be thrown; `found` empty: what the input says there.
+  InputError error(const std::string& key, std::string expected, std::string found = {}) const;
 
   std::string keys_text() const;
   std::string keys_markdown() const;

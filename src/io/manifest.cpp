@@ -63,18 +63,24 @@ void write_manifest(const std::string& path, const Manifest& m) {
   const std::string text = fmt::format(
       "{{\n  \"program\": \"dendrift{}d\",\n  \"version\": {},\n  \"git_hash\": {},\n  \"compiler\": {},\n"
       "  \"build_type\": {},\n  \"flags\": {},\n  \"machine\": {{\"host\": {}, \"cpu\": {}}},\n  \"ranks\": {},\n"
-      "  \"threads\": {},\n  \"start\": {},\n  \"end\": {},\n  \"status\": {},\n  \"steps\": {},\n"
+      "  \"threads\": {},\n  \"start\": {},\n  \"end\": {},\n  \"status\": {},\n  \"exit_code\": {},\n"
+      "  \"message\": {},\n  \"steps\": {},\n"
       "  \"time_s\": {},\n  \"blocks\": {},\n  \"block_cells\": {},\n  \"wall_s\": {:.3f},\n"
       "  \"wall_by_phase\": {{{}\n  }},\n  \"input\": {}\n}}\n",
       DIM, quoted(build_info::version), quoted(build_info::git_hash), quoted(build_info::compiler),
       quoted(build_info::build_type), quoted(build_info::flags), quoted(host), quoted(cpu_model()), m.ranks,
       omp_get_max_threads(), quoted(m.started), quoted(m.status == "running" ? "" : time_stamp()), quoted(m.status),
-      m.steps, m.time_s, m.blocks, m.block_cells, m.wall_s, phases, quoted(m.input));
+      m.exit_code ? std::to_string(*m.exit_code) : "null", quoted(m.message), m.steps,
+      m.time_s, m.blocks, m.block_cells, m.wall_s, phases, quoted(m.input));
   const std::string part = path + ".part";
   std::FILE* f = std::fopen(part.c_str(), "w");
   if (f == nullptr) throw OutputError(part, "create the file", std::strerror(errno));
   const bool written = std::fwrite(text.data(), 1, text.size(), f) == text.size();
-  if (std::fclose(f) != 0 || !written) throw OutputError(part, "write the file", std::strerror(errno));
+  if (std::fclose(f) != 0 || !written) {
+    const std::string reason = std::strerror(errno);
+    remove_quietly(part);
+    throw OutputError(part, "write the file", reason);
+  }
   rename_file(part, path);
 }
 

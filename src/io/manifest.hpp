@@ -4,12 +4,15 @@
 
 #include <cstdint>
 #include <map>
+#include <optional>
 #include <string>
 
 namespace dendrift::io {
 
 struct Manifest {
-  std::string status;   ///< running, done, stopped, failed: ...
+  std::string status;   ///< running, done, stopped, failed
+  std::optional<int> exit_code;  ///< none while it runs
+  std::string message;  ///< why it failed
   std::string started;  ///< ISO 8601
   int ranks = 1;
   std::string input;  ///< resolved, TOML

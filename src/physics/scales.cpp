@@ -14,6 +14,10 @@ void AlloyOptions::declare(io::Schema& schema) {
       .doc("slope of the liquidus line, negative for k < 1");
   t.real("gibbs_thomson_um_K", gibbs_thomson_um_k).unit("um K").above(0).doc("Gibbs-Thomson coefficient");
   t.real("diffusivity_um2_s", diffusivity_um2_s).unit("um2/s").above(0).doc("of the solute in the liquid");
+  t.real("viscosity_um2_s", viscosity_um2_s)
+      .unit("um2/s")
+      .above(0)
+      .doc("kinematic viscosity of the melt; a prescribed flow does not use it");
   t.real("supersaturation", supersaturation)
       .above(0)
       .below(1)
@@ -33,6 +37,7 @@ Scales::Scales(const AlloyOptions& a) {
   lambda = A1 * a.width_over_d0;
   diffusivity = A2 * lambda;
   tau0_s = diffusivity * w0_um * w0_um / a.diffusivity_um2_s;
+  viscosity = a.viscosity_um2_s * tau0_s / (w0_um * w0_um);
 }
 
 }  // namespace dendrift::physics

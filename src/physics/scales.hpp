@@ -15,6 +15,7 @@ struct AlloyOptions {
   double liquidus_slope_k_per_wt = -2.65;
   double gibbs_thomson_um_k = 0.236;
   double diffusivity_um2_s = 2400;
+  double viscosity_um2_s = 5e5;
   double supersaturation = 0.2;
   double width_over_d0 = 10;
 
@@ -31,6 +32,7 @@ struct Scales {
   double tau0_s = 0;       ///< unit of time, 0.6267 lambda W0^2/D
   double lambda = 0;       ///< 0.8839 W0/d0
   double diffusivity = 0;  ///< D tau0/W0^2 = 0.6267 lambda
+  double viscosity = 0;    ///< nu tau0/W0^2 of the melt
 
   explicit Scales(const AlloyOptions& alloy);
   Scales() = default;

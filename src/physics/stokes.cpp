@@ -52,7 +52,8 @@ StokesSolver::StokesSolver(const amr::Mesh& mesh, const StokesOptions& options)
   amr::Links laplacian;
   for (auto& along : laplacian.along) along.factor = 1;
   pressure_cycle_ = std::make_unique<amr::Multigrid>(hierarchy_, std::vector<Component>{components_[DIM]},
-                                                     std::vector<amr::Links>{laplacian}, viscosity_);
+                                                     std::vector<amr::Links>{laplacian}, viscosity_,
+                                                     amr::MultigridOptions{.smoothings = 1});
   gmres_.residual = [this](const Vector& x, Vector& r) {
     unpack(x, state_);
     hierarchy_.make_composite(state_, 1, false);
@@ -306,7 +307,7 @@ void StokesSolver::precondition(HierarchyField& r) {
     double* p = pressure_.at(g, i, 0);
     amr::for_each_cell({}, filled(layout.n), [&](const IntVec& q) {
       const std::ptrdiff_t o = layout.offset(q);
-      p[o] = 2 * nu[o] * d[o] + (sigma_ > 0 ? sigma_ * lap[o] : 0.0);
+      p[o] = nu[o] * d[o] + (sigma_ > 0 ? sigma_ * lap[o] : 0.0);
     });
   });
   hierarchy_.make_composite(pressure_, 1, true);

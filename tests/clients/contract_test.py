@@ -3,6 +3,7 @@
 codes, stopping and restarting."""
 import json
 import math
+import os
 import re
 import resource
 import shutil
@@ -32,7 +33,7 @@ GRAINS = {2: ["time_s", "grain", "x_um", "y_um", "vx_um_s", "vy_um_s", "omega_ra
 FIELDS = {2: ["phi", "U", "c", "alpha", "velocity_x", "velocity_y", "pressure", "level", "rank", "grain"],
           3: ["phi", "U", "c", "alpha", "velocity_x", "velocity_y", "velocity_z", "pressure", "level", "rank", "grain"]}
 MANIFEST = ["version", "git_hash", "compiler", "flags", "ranks", "threads", "machine", "input", "start", "end",
-            "status", "wall_s", "wall_by_phase"]
+            "status", "exit_code", "message", "wall_s", "wall_by_phase"]
 KEYS = ["run.end_time_s", "run.max_steps", "run.wall_clock_limit_s", "output.dir", "output.plot_every_s",
         "output.checkpoint_every_s", "mesh.dim"]  # those that scripts override
 
@@ -43,6 +44,7 @@ D0_UM = GIBBS_THOMSON / (SLOPE * C_L * (1 - K))
 W0_UM = W0_OVER_D0 * D0_UM
 LAMBDA = 0.8839 * W0_OVER_D0
 TAU0_S = 0.6267 * LAMBDA * W0_UM**2 / DIFFUSIVITY
+VISCOSITY = 5e5  # um2/s
 
 # A quarter of a crystal, and an eighth of one; 5 tau0, in seconds because scripts override seconds.
 SCENES = {2: """
@@ -138,7 +140,7 @@ def check_check(folder):
         require("\noutput dir: some/where\n" in text, f"--check does not name the output folder: {text}")
         numbers = {m[1]: float(m[2]) for m in re.finditer(r"^(\w+) +(-?[\d.]+(?:e[-+]?\d+)?)", text, re.M)}
         expected = {"c_l": C_L, "d0": D0_UM, "W0": W0_UM, "tau0": TAU0_S, "lambda": LAMBDA, "D": 0.6267 * LAMBDA,
-                    "end": 5, "dx": 1}
+                    "nu": VISCOSITY * TAU0_S / W0_UM**2, "end": 5, "dx": 1}
         for name, value in expected.items():
             require(close(numbers.get(name, 0), value, 1e-5), f"--check: {name} = {value} expected: {text}")
         for name in ("dt", "cells", "memory", "cost"):
@@ -151,6 +153,13 @@ def check_check(folder):
     text = run(write_scene(folder, 2), "--check", "mesh.dim=3", "mesh.size_W0=[64,64,64]", "mesh.root_blocks=[1,1,1]",
                "seed[0].position_W0=[0,0,0]", cwd=folder).out
     require("\nbox     64 64 64 W0" in text, f"mesh.dim=3 on the command line: {text}")
+    # A mesh beyond the memory of the machine: four arrays or more of 36^3 numbers in each of 1000000 blocks, 1.5 TB
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    for words in (["--check"], []) if memory < 1e12 else ():
+        result = run(write_scene(folder, 3), *words, "mesh.size_W0=[3200,3200,3200]", "mesh.root_blocks=[100,100,100]",
+                     "mesh.levels=1", "mesh.block_cells=32", code=2, cwd=folder)
+        for word in ("mesh.root_blocks", "expected: a mesh that fits into the memory", "found:    1000000 blocks"):
+            require(word in result.err, f"'{word}' expected: {result}")
     say("--check: derived numbers, output dir, nothing written")
 
 
@@ -221,6 +230,7 @@ def check_files(folder, dim, keys):
     manifest = json.loads((out / "manifest.json").read_text())
     require(set(MANIFEST) <= manifest.keys(), f"{dim}D: manifest.json lacks {set(MANIFEST) - manifest.keys()}")
     require((manifest["status"], manifest["ranks"], manifest["threads"]) == ("done", 2, 2), f"{dim}D: {manifest}")
+    require((manifest["exit_code"], manifest["message"]) == (0, ""), f"{dim}D: {manifest}")
     require(manifest["steps"] == steps[5] and close(manifest["time_s"], 5 * TAU0_S), f"{dim}D: {manifest}")
     stamps = [time.strptime(manifest[k], "%Y-%m-%dT%H:%M:%SZ") for k in ("start", "end")]
     require(stamps[0] <= stamps[1], f"{dim}D: start and end {manifest['start']}, {manifest['end']}")
@@ -271,7 +281,7 @@ def check_stopped(folder, scene, name):
     """A stopped run has a checkpoint of its last step, and goes on from it."""
     out = folder / "out"
     manifest = json.loads((out / "manifest.json").read_text())
-    require(manifest["status"] == "stopped", f"{name}: status {manifest['status']}")
+    require((manifest["status"], manifest["exit_code"]) == ("stopped", 75), f"{name}: status {manifest['status']}")
     last = manifest["steps"]
     require(f"chk_{last:07d}.h5" in names(out), f"{name}: stopped at step {last}, files {sorted(names(out))}")
     before = column(out / "diagnostics.csv", "step", int)
@@ -311,7 +321,8 @@ def check_stopping(folder):
     require(result.code == -signal.SIGKILL, f"{result}")
     require((folder / "out/diagnostics.csv").read_text().endswith("\n"), "a torn line in diagnostics.csv")
     require(len(read_csv(folder / "out/diagnostics.csv")[1]) >= 3, "lines of a killed run are lost")
-    require(json.loads((folder / "out/manifest.json").read_text())["status"] == "running", "status of a killed run")
+    manifest = json.loads((folder / "out/manifest.json").read_text())
+    require((manifest["status"], manifest["exit_code"]) == ("running", None), "status of a killed run")
     shutil.rmtree(folder / "out")
     say("SIGKILL: whole lines in diagnostics.csv")
 
@@ -326,7 +337,8 @@ def check_numerical_failure(folder):
         result = run(scene, "output.dir=out", "--restart", checkpoint, ranks=ranks, code=3, cwd=folder)
         require(len(re.findall(r"not finite at step \d+", result.err)) == 1, f"no cause, or more than one: {result}")
         manifest = json.loads((folder / "out/manifest.json").read_text())
-        require("not finite" in manifest["status"], f"status {manifest['status']}")
+        require((manifest["status"], manifest["exit_code"]) == ("failed", 3) and "not finite" in manifest["message"],
+                f"status {manifest['status']}, {manifest['exit_code']}, {manifest['message']}")
         saved = [n for n in names(folder / "out") - {checkpoint.name} if n.endswith(f"_{manifest['steps']:07d}.h5")]
         require(saved, f"the state of step {manifest['steps']} was not saved: {sorted(names(folder / 'out'))}")
         (folder / "out" / saved[0]).unlink()
@@ -351,6 +363,16 @@ def check_output_failures(folder):
         resource.setrlimit(resource.RLIMIT_FSIZE, limit)
     require("plt_0000000.hdf" in result.err, f"the file is not named: {result}")
     require(not {n for n in names(folder / "out") if n.startswith("plt")}, "half a plotfile was left")
+    manifest = json.loads((folder / "out/manifest.json").read_text())
+    require((manifest["status"], manifest["exit_code"]) == ("failed", 4) and "plt_0000000.hdf" in manifest["message"],
+            f"status {manifest['status']}, {manifest['exit_code']}, {manifest['message']}")
+    shutil.rmtree(folder / "out")
+    # A folder in the place of a file
+    (folder / "out/diagnostics.csv").mkdir(parents=True)
+    for ranks in (0, 2):
+        run(scene, "output.dir=out", ranks=ranks, code=4, cwd=folder)
+        manifest = json.loads((folder / "out/manifest.json").read_text())
+        require(manifest["status"] == "failed" and "diagnostics.csv" in manifest["message"], f"manifest {manifest}")
     shutil.rmtree(folder / "out")
     say("output that cannot be written: exit code 4 with the cause")
 
@@ -406,8 +428,40 @@ def check_bad_restarts(folder):
     for words in (["mesh.size_W0=[256, 128]"], ["mesh.root_blocks=[4, 2]"], ["mesh.levels=3"], ["mesh.block_cells=16"],
                   ["mesh.xlo=periodic", "mesh.xhi=periodic"], ["seed[1].position_W0=[90, 40]", "seed[1].radius_W0=5"]):
         refused(good.name, [scenes[2], *words, "--restart", good], "", code=(2, 4))
+    # An end before the time of the checkpoint, and the same in steps
+    with h5py.File(good) as file:
+        time_tau0, step = file.attrs["time_tau0"], int(file.attrs["step"])
+    for word, key in ((f"run.end_time_s={0.99 * time_tau0 * TAU0_S}", "run.end_time_s"),
+                      (f"run.end_time_tau0={0.99 * time_tau0}", "run.end_time_tau0"),
+                      (f"run.max_steps={step - 1}", "run.max_steps")):
+        for ranks in (0, 2):
+            refused(key, [scenes[2], word, "--restart", good], "at least", ranks=ranks, code=2)
+        refused(key, [scenes[2], word, "--restart", good, "--check"], "at least", code=2)
     require(not failures, f"{len(failures)} of the restarts above")
-    say(f"--restart: {len(cases)} bad files, 6 checkpoints of other scenes: refused with the cause, nothing touched")
+    say(f"--restart: {len(cases)} bad files, 6 checkpoints of other scenes, 3 ends before "
+        "the checkpoint: refused with the cause, nothing touched")
+
+
+def check_kept_checkpoints(folder):
+    """output.keep_checkpoints counts those from before a restart; those after its state go first."""
+    scene, out = write_scene(folder, 2), folder / "out"
+    every = ["output.checkpoint_every_steps=5", "output.dir=out"]
+
+    def kept():
+        return sorted(int(n[4:11]) for n in names(out) if n.startswith("chk_"))
+
+    run(scene, *every, "run.max_steps=16", "output.keep_checkpoints=3", cwd=folder)
+    require(kept() == [5, 10, 15], f"checkpoints {kept()}")
+    shutil.copytree(out, folder / "copy")
+    run(scene, *every, "run.max_steps=21", "output.keep_checkpoints=3", "--restart", "out", ranks=2, cwd=folder)
+    require(kept() == [10, 15, 20], f"checkpoints after a restart: {kept()}")
+    run(scene, *every, "run.max_steps=26", "output.keep_checkpoints=1", "--restart", "out", cwd=folder)
+    require(kept() == [25], f"checkpoints after a restart that keeps one: {kept()}")
+    shutil.rmtree(out)
+    (folder / "copy").rename(out)
+    run(scene, *every, "run.max_steps=11", "output.keep_checkpoints=2", "--restart", out / "chk_0000005.h5", cwd=folder)
+    require(kept() == [5, 10], f"checkpoints after a restart from an older one: {kept()}")
+    say("output.keep_checkpoints: counts those from before a restart")
 
 
 def main():
@@ -428,6 +482,7 @@ def main():
     check(check_numerical_failure)
     check(check_output_failures)
     check(check_bad_restarts)
+    check(check_kept_checkpoints)
     require(not failures, ", ".join(failures))
 
 

@@ -2,6 +2,8 @@
 
 #include <gtest/gtest.h>
 
+#include "memory.hpp"
+
 namespace dendrift {
 namespace {
 
@@ -44,6 +46,55 @@ TEST(ChooseShape, CellsAreCubesAndNeverLargerThanAsked) {
 
 TEST(ChooseShape, RefusesSidesThatNoCubesTile) {
   EXPECT_THROW(shape_of(100, 100 * 3.14159265, 1), std::invalid_argument);
+}
+
+TEST(ChooseShape, RefusesBoxesBeyondTheKeysOfTheTree) {
+  EXPECT_THROW(shape_of(1e300, 1e300, 1), std::invalid_argument);
+  EXPECT_THROW(shape_of(16, 1e12, 1), std::invalid_argument);
+  EXPECT_THROW(shape_of(1e12, 16, 1), std::invalid_argument);
+}
+
+// The issue of an input whose mesh is absurd.
+std::string problem_of(const std::string& size, const std::string& roots, int levels) {
+  const auto vector = [](const std::string& x) {
+    return "[" + x + ", 1" + (DIM == 3 ? ", 1]" : "]");
+  };
+  Settings settings;
+  try {
+    settings.parse_text("run.end_time_tau0 = 1\nmesh.dim = " + std::to_string(DIM) + "\nmesh.size_W0 = " + vector(size) +
+                            "\nmesh.root_blocks = " + vector(roots) + "\nmesh.levels = " + std::to_string(levels) +
+                            "\n[[seed]]\nposition_W0 = " + vector("1") + "\nradius_W0 = 8\n",
+                        "test", {});
+  } catch (const io::InputError& e) {
+    EXPECT_EQ(e.issues().size(), 1) << e.what();
+    return e.issues()[0].key;
+  }
+  return "";
+}
+
+TEST(Settings, RefuseTreesThatNoMachineHolds) {
+  EXPECT_EQ(problem_of("1000000", "1000000", 1), "");
+  EXPECT_EQ(problem_of("1000001", "1000001", 1), "mesh.root_blocks");
+  const std::int64_t most = amr::Tree::MOST_ALONG_AXIS >> 15;
+  EXPECT_EQ(problem_of(std::to_string(most), std::to_string(most), 16), "");
+  EXPECT_EQ(problem_of(std::to_string(most + 1), std::to_string(most + 1), 16), "mesh.levels");
+}
+
+TEST(Memory, CountsFieldsAndTree) {
+  const amr::Layout layout{16};
+  const double one = bytes_of_rank(1, 1, 10, layout);
+  EXPECT_GE(one, 10 * 8 * std::pow(20, DIM));
+  EXPECT_LE(one, 10 * 8 * std::pow(20, DIM) + 500);
+  // Two ranks share the fields, not the tree.
+  EXPECT_GT(bytes_of_rank(1000, 2, 10, layout), 500 * one);
+  EXPECT_LT(bytes_of_rank(1000, 2, 10, layout), 520 * one);
+  amr::FieldTable fields;
+  amr::FieldSpec f;
+  f.name = "a";
+  fields.add_cell(f);
+  EXPECT_TRUE(memory_of_mesh(1, fields, layout, MPI_COMM_SELF).enough());
+  const Memory much = memory_of_mesh(std::int64_t{1} << 40, fields, layout, MPI_COMM_SELF);
+  EXPECT_FALSE(much.enough()) << much.needed << " of " << much.present;
 }
 
 }  // namespace

@@ -467,7 +467,7 @@ TEST(Tree, RefinesOneCornerToTheDeepestLevel) {
   int deepest = 0;
   for (const IntVec& roots : {test::vec(1, 1, 1), test::vec(2, 1, 2), test::vec(5, 3, 4)}) {
     for (const bool high : {false, true}) {
-      // A forest whose curve does not fit into a key may be refused, but not mistaken for another one.
+      // A forest whose curve does not fit into a key is refused, not mistaken for another one.
       std::optional<Tree> tree;
       try {
         tree.emplace(roots, Array<bool>{}, 20);
@@ -489,6 +489,25 @@ TEST(Tree, RefinesOneCornerToTheDeepestLevel) {
     }
   }
   EXPECT_GE(deepest, 4) << "up to two roots a side must be granted";
+}
+
+TEST(Tree, RefusesMoreBlocksAlongAnAxisThanItsKeysHold) {
+  for (const int level : {0, 10, 20}) {
+    const auto most = static_cast<int>(Tree::MOST_ALONG_AXIS >> level);
+    for (int a = 0; a < DIM; ++a) {
+      IntVec roots = filled(1);
+      roots[a] = most;
+      EXPECT_TRUE(Tree::fits(roots, level)) << test::text(roots) << " level " << level;
+      ++roots[a];
+      EXPECT_FALSE(Tree::fits(roots, level)) << test::text(roots) << " level " << level;
+      try {
+        const Tree tree(roots, Array<bool>{}, level);
+        ADD_FAILURE() << test::text(roots) << " level " << level << " was granted";
+      } catch (const std::invalid_argument& e) {
+        EXPECT_NE(std::string(e.what()).find("along an axis"), std::string::npos) << e.what();
+      }
+    }
+  }
 }
 
 TEST(Tree, FromLeavesInAnyOrder) {

@@ -1,0 +1,190 @@
+// The Stokes solver against numbers that do not come from it.
+#include "physics/stokes.hpp"
+
+#include <gtest/gtest.h>
+
+#include "physics/flow.hpp"
+#include "support/mesh_fixture.hpp"
+
+namespace dendrift::test {
+namespace {
+
+using physics::StokesOptions;
+using physics::StokesSolver;
+
+RealVec filled_real(double x) {
+  RealVec r{};
+  r.fill(x);
+  return r;
+}
+
+RealVec place(const amr::Block& b, const IntVec& q, int normal) {
+  RealVec x{};
+  for (int a = 0; a < DIM; ++a) x[a] = b.lo[a] + (q[a] + (a == normal ? 0.0 : 0.5)) * b.dx;
+  return x;
+}
+
+// A box of side `side` with walls, refined where want(block) says so.
+template <class Want>
+amr::Mesh box(double side, int roots, int cells, int levels, Want&& want) {
+  amr::MeshShape s;
+  s.root_blocks = filled(roots);
+  s.max_level = levels - 1;
+  s.block_cells = cells;
+  s.root_dx = side / (roots * cells);
+  s.sides.fill(amr::Side::wall);
+  amr::Mesh mesh(s, {}, MPI_COMM_SELF);
+  for (int level = 1; level < levels; ++level) {
+    std::vector<std::int8_t> change(static_cast<std::size_t>(mesh.tree().size()));
+    for (int i = 0; i < mesh.tree().size(); ++i)
+      change[static_cast<std::size_t>(i)] = want(mesh.describe(mesh.tree().leaf(i))) ? 1 : 0;
+    amr::Tree tree = mesh.tree().adapted(change);
+    const std::vector<int> owners(static_cast<std::size_t>(tree.size()), 0);
+    put(mesh, std::move(tree), owners);
+  }
+  return mesh;
+}
+
+template <class Force>
+void set_force(StokesSolver& solver, const amr::Mesh& mesh, Force&& force) {
+  for (int b = 0; b < mesh.size(); ++b) {
+    const auto [g, i] = solver.hierarchy().place_of_block(b);
+    for (int a = 0; a < DIM; ++a)
+      amr::for_each_cell({}, filled(mesh.layout().n + 1), [&](const IntVec& q) {
+        solver.force().at(g, i, a)[mesh.layout().offset(q)] = force(a, place(mesh.block(b), q, a));
+      });
+  }
+}
+
+struct Disc {
+  double radius;
+  RealVec centre;
+  double phi(const RealVec& x) const {
+    double r2 = 0;
+    for (int a = 0; a < DIM; ++a) r2 += (x[a] - centre[a]) * (x[a] - centre[a]);
+    return std::tanh((radius - std::sqrt(r2)) / std::sqrt(2.0));
+  }
+};
+
+struct Settled {
+  int iterations;
+  double core, mean, divergence;
+};
+
+// A disc (sphere) of weight 1 a volume in a melt of viscosity 1, without inertia.
+Settled settle(amr::Mesh& mesh, const Disc& disc, double ratio, physics::ViscosityLaw law, double sigma = 0) {
+  StokesOptions o;
+  o.tolerance = 1e-6;
+  StokesSolver solver(mesh, o);
+  const int n = mesh.layout().n;
+  solver.set_viscosity(
+      [&](int b, double* phi) {
+        for_all(mesh.layout(), [&](const IntVec& q) { phi[mesh.layout().offset(q)] = disc.phi(place(mesh.block(b), q, -1)); });
+      },
+      [&](double phi) { return physics::relative_viscosity(law, ratio, phi); });
+  set_force(solver, mesh, [&](int a, RealVec x) { return a == DIM - 1 ? 0.5 * (1 + disc.phi(x)) : 0.0; });
+  const physics::StokesResult r = solver.solve(sigma);
+  EXPECT_TRUE(r.converged);
+  double core = 0, cores = 0, all = 0, solid = 0;
+  for (int b = 0; b < mesh.size(); ++b) {
+    const auto [g, i] = solver.hierarchy().place_of_block(b);
+    amr::for_each_cell({}, filled(n), [&](const IntVec& q) {
+      const double* u = solver.state().at(g, i, DIM - 1) + mesh.layout().offset(q);
+      const double v = 0.5 * (u[0] + u[mesh.layout().stride(DIM - 1)]), volume = std::pow(mesh.block(b).dx, DIM);
+      const double f = 0.5 * (1 + disc.phi(place(mesh.block(b), q, -1)));
+      if (f > 0.999) core += volume * v, cores += volume;
+      all += f * volume * v;
+      solid += f * volume;
+    });
+  }
+  return {r.iterations, core / cores, all / solid, r.divergence_max};
+}
+
+// Direct sparse solutions of the staggered problem: h3 at ratio 1e5, R = 10, closed box of 80, nu_l = 1.
+TEST(Stokes, DiffuseDiscFallsAtTheKnownSpeed) {
+  if (DIM == 3) GTEST_SKIP() << "the number is for a disc";
+  amr::Mesh uniform = box(80, 5, 16, 1, [](const amr::Block&) { return false; });
+  const Settled s = settle(uniform, {10, filled_real(40)}, 1e5, physics::ViscosityLaw::h3);
+  EXPECT_NEAR(s.core, 13.99, 0.01 * 13.99);
+  EXPECT_NEAR(s.mean, 13.78, 0.01 * 13.78);
+  EXPECT_LT(s.divergence, 1e-5);
+}
+
+TEST(Stokes, LinearLawMakesTheDiscSlow) {
+  if (DIM == 3) GTEST_SKIP() << "the number is for a disc";
+  amr::Mesh uniform = box(80, 5, 16, 1, [](const amr::Block&) { return false; });
+  EXPECT_NEAR(settle(uniform, {10, filled_real(40)}, 1e6, physics::ViscosityLaw::linear).core, 3.296, 0.01 * 3.296);
+}
+
+TEST(Stokes, RefinedMeshGivesTheUniformAnswer) {
+  const double side = DIM == 2 ? 128 : 64;
+  const Disc disc{10, filled_real(side / 2)};
+  const auto near_disc = [&](const amr::Block& b) {
+    double square = 0;
+    for (int a = 0; a < DIM; ++a) {
+      const double d = std::max(0.0, std::abs(b.lo[a] + 4 * b.dx - side / 2) - 4 * b.dx);
+      square += d * d;
+    }
+    return square < 18 * 18;
+  };
+  const int levels = DIM == 2 ? 3 : 2;
+  amr::Mesh fine = box(side, DIM == 2 ? 16 : 8, 8, 1, near_disc);
+  amr::Mesh refined = box(side, (DIM == 2 ? 16 : 8) >> (levels - 1), 8, levels, near_disc);
+  ASSERT_LT(refined.tree().size(), fine.tree().size());
+  const double ratio = DIM == 2 ? 1e6 : 1e4;
+  const Settled a = settle(fine, disc, ratio, physics::ViscosityLaw::h3), b = settle(refined, disc, ratio, physics::ViscosityLaw::h3);
+  EXPECT_NEAR(b.core, a.core, 0.005 * a.core);
+}
+
+TEST(Stokes, IterationsDoNotGrowWithTheRatio) {
+  const double side = DIM == 2 ? 128 : 32;
+  amr::Mesh mesh = box(side, DIM == 2 ? 8 : 2, 16, 1, [](const amr::Block&) { return false; });
+  for (const double ratio : {1.0, 1e2, 1e4, 1e6, 1e8})
+    for (const double sigma : {0.0, 1e-3, 1.0}) {
+      const Settled s = settle(mesh, {DIM == 2 ? 20.0 : 8.0, filled_real(side / 2)}, ratio, physics::ViscosityLaw::h3, sigma);
+      EXPECT_LT(s.iterations, 75) << "ratio " << ratio << ", sigma " << sigma;
+      EXPECT_LT(s.divergence, 1e-4) << "ratio " << ratio << ", sigma " << sigma;
+    }
+}
+
+// No slip at the walls of the unit box: v = curl of [sin(pi x) sin(pi y)]^2, p = cos(pi x) sin(pi y), nu = 1.
+TEST(Stokes, OrderTwoAcrossLevels) {
+  if (DIM == 3) GTEST_SKIP() << "the solution is plane";
+  const auto u = [](double x, double y) { return std::pow(std::sin(M_PI * x), 2) * std::sin(2 * M_PI * y); };
+  const auto lap = [](double x, double y) {  // of u
+    return M_PI * M_PI * std::sin(2 * M_PI * y) * (2 * std::cos(2 * M_PI * x) - 4 * std::pow(std::sin(M_PI * x), 2));
+  };
+  std::vector<double> errors;
+  for (const int roots : {4, 8, 16}) {
+    amr::Mesh mesh = box(1, roots, 8, 2, [](const amr::Block& b) {
+      return std::abs(b.lo[0] + 4 * b.dx - 0.4) < 0.25 && std::abs(b.lo[1] + 4 * b.dx - 0.5) < 0.2;
+    });
+    StokesOptions o;
+    o.tolerance = 1e-9;
+    StokesSolver solver(mesh, o);
+    solver.set_viscosity([&](int, double* phi) { for_all(mesh.layout(), [&](const IntVec& q) { phi[mesh.layout().offset(q)] = -1; }); },
+                         [](double) { return 1.0; });
+    set_force(solver, mesh, [&](int a, RealVec x) {
+      return a == 0 ? -lap(x[0], x[1]) - M_PI * std::sin(M_PI * x[0]) * std::sin(M_PI * x[1])
+                    : lap(x[1], x[0]) + M_PI * std::cos(M_PI * x[0]) * std::cos(M_PI * x[1]);
+    });
+    ASSERT_TRUE(solver.solve(0).converged);
+    double square = 0;
+    for (int b = 0; b < mesh.size(); ++b) {
+      const auto [g, i] = solver.hierarchy().place_of_block(b);
+      for (int a = 0; a < 2; ++a)
+        amr::for_each_cell({}, filled(mesh.layout().n), [&](const IntVec& q) {
+          const RealVec x = place(mesh.block(b), q, a);
+          const double want = a == 0 ? u(x[0], x[1]) : -u(x[1], x[0]);
+          const double e = solver.state().at(g, i, a)[mesh.layout().offset(q)] - want;
+          square += e * e * mesh.block(b).dx * mesh.block(b).dx;
+        });
+    }
+    errors.push_back(std::sqrt(square));
+  }
+  EXPECT_GT(std::log2(errors[0] / errors[1]), 1.8) << errors[0] << " " << errors[1];
+  EXPECT_GT(std::log2(errors[1] / errors[2]), 1.8) << errors[1] << " " << errors[2];
+}
+
+}  // namespace
+}  // namespace dendrift::test
