@@ -131,11 +131,17 @@ Settings::Settings() {
       checks.fail("mesh.dim", std::to_string(DIM) + " in this program (the launcher `dendrift` picks the right one)");
       return;
     }
+    // The checks before this one have reported what is missing; it must not be read.
+    const bool sized = mesh.size_w0 || mesh.size_um;
+    const bool seeded = std::ranges::all_of(seed, [](const physics::SeedOptions& o) {
+      return (o.position_w0 || o.position_um) && (o.radius_w0 || o.radius_um);
+    });
     const physics::Scales s(alloy);
     RealVec size{};
-    for (int a = 0; a < DIM; ++a) size[a] = mesh.size_w0 ? (*mesh.size_w0)[a] : (*mesh.size_um)[a] / s.w0_um;
+    for (int a = 0; sized && a < DIM; ++a) size[a] = mesh.size_w0 ? (*mesh.size_w0)[a] : (*mesh.size_um)[a] / s.w0_um;
     try {
-      require_sane_tree(checks, choose_shape(size, mesh), mesh);
+      if (sized && mesh.root_blocks.has_value() == mesh.levels.has_value())
+        require_sane_tree(checks, choose_shape(size, mesh), mesh);
     } catch (const std::invalid_argument& e) {
       checks.fail("mesh", e.what(), "a box that does not fit");
     }
@@ -149,6 +155,7 @@ Settings::Settings() {
         {"output.diagnostics_every_tau0", output.diagnostics_every_tau0}};
     for (const auto& [key, tau0] : intervals)
       if (tau0 && *tau0 < SHORTEST) checks.fail(key, "at least .001 tau0: steps end on output times");
+    if (!sized || !seeded) return;
     const std::vector<physics::Seed> seeds = physics::make_seeds(seed, s);
     for (std::size_t i = 0; i < seeds.size(); ++i)
       for (int a = 0; a < DIM; ++a)
