@@ -48,6 +48,11 @@ def carried(r):
             num(r["area_change_percent"], 2) + " %", num(r["U_rms_error"], 4), num(r["U_min"], 4) + ", " + num(r["U_max"], 4)]
 
 
+def disc(r):
+    return [r["dx_W0"], r["levels"], r["law"], f"{float(r['ratio']):.0e}", num(r["speed"], 3),
+            num(r["error_percent"], 2) + " %" if r["error_percent"] else "", r["iterations"]]
+
+
 def width_rows():
     table = rows("width")
     base = next(float(r["tip_um"]) for r in table if r["W0_over_d0"] == "10" and r["dx_W0"] == "0.8")
@@ -64,7 +69,7 @@ def karma_rows():
 TABLES = {
     "growth": lambda: map(growth, rows("growth_2d")), "growth_dt": lambda: map(growth_dt, rows("growth_2d_time_step")),
     "growth_3d": lambda: map(growth_3d, rows("growth_3d")), "rotation": lambda: map(rotation, rows("rotation")),
-    "drift": lambda: map(drift, rows("drift")), "carried": lambda: map(carried, rows("carried")),
+    "drift": lambda: map(drift, rows("drift")), "carried": lambda: map(carried, rows("carried")), "disc": lambda: map(disc, rows("disc")),
     "width": width_rows, "karma": karma_rows,
 }
 

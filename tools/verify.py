@@ -38,7 +38,7 @@ class Run:
         check = subprocess.run([os.path.join(ARGS.build, "dendrift"), os.path.join(ROOT, "inputs", "verification", name),
                                 *overrides, "run.max_steps=1", "--check"], capture_output=True, text=True).stdout
         self.scale = {line.split()[0]: float(line.split()[1]) for line in check.splitlines()
-                      if line.split()[0] in ("W0", "tau0", "d0", "lambda", "D", "dx")}
+                      if line.split()[0] in ("W0", "tau0", "d0", "lambda", "D", "nu", "dx")}
         self.manifest = json.load(open(os.path.join(self.dir, "manifest.json")))
         self.wall = self.manifest["wall_s"]
         w0, tau0 = self.scale["W0"], self.scale["tau0"]
@@ -308,6 +308,23 @@ def composition(r):
     p = plotfile.Plotfile(os.path.join(r.dir, last))
     u, phi = p.uniform("U")[0], p.uniform("phi")[0]
     return float(u.min()), float(u.max()), float(np.sqrt(np.mean((u[phi > -0.9] + 0.2) ** 2)))
+
+
+@case
+def disc():
+    """A disc that settles in a closed box without inertia: mean velocity of the solid over b/nu, and how rigid it is."""
+    rows = []
+    for dx, levels, roots in ((1.0, 1, 5), (0.5, 1, 10), (0.5, 2, 5), (0.25, 1, 20)):
+        for law, ratio, reference in (("h3", 1e5, 13.78), ("h1", 1e5, ""), ("h3", 1e6, ""), ("linear", 1e6, "")):
+            r = Run("disc_settling.toml", f"mesh.root_blocks=[{roots},{roots}]", f"mesh.levels={levels}",
+                    f'flow.viscosity="{law}"', f"flow.viscosity_ratio={ratio}")
+            last = list(csv.DictReader(open(os.path.join(r.dir, "grains.csv"))))[-1]
+            b = 1e7 * r.scale["tau0"] ** 2 / r.scale["W0"] * (2.7 / 2.45 - 1)
+            v = -float(last["vy_um_s"]) * r.scale["tau0"] / r.scale["W0"] / (b / r.scale["nu"])
+            rows.append({"dx_W0": dx, "levels": levels, "law": law, "ratio": ratio, "speed": v, "reference": reference,
+                         "error_percent": percent(v, reference) if reference else "", "nonrigidity": float(last["nonrigidity"]),
+                         "iterations": max(int(d["flow_iterations"]) for d in r.diagnostics), "wall_s": r.wall})
+    write("disc", rows)
 
 
 @case

@@ -6,6 +6,21 @@
 
 namespace dendrift::amr {
 
+/// child_value along all axes but `normal`; reads nothing off that plane.
+inline double child_value_across(const double* c, const Array<std::ptrdiff_t>& stride, const Array<double>& s, int normal) {
+  double v = *c;
+  for (int a = 0; a < DIM; ++a) {
+    if (a == normal) continue;
+    v += 0.125 * s[a] * (c[stride[a]] - c[-stride[a]]);
+    for (int b = a + 1; b < DIM; ++b) {
+      if (b == normal) continue;
+      const std::ptrdiff_t p = stride[a] + stride[b], m = stride[a] - stride[b];
+      v += 0.015625 * s[a] * s[b] * ((c[p] + c[-p]) - (c[m] + c[-m]));
+    }
+  }
+  return v;
+}
+
 /// Third-order value at a fine place from the coarse array round it: cells (normal < 0) or the faces of one axis.
 /// `c` counts coarse cells from the one that holds fine cell 0; n: fine cells along a side. Means over the fine
 /// faces of a coarse face keep its value. Needs coarse places -2 to n/2 + 1.
@@ -14,12 +29,13 @@ inline double fine_value(const ArrayRef<const double>& c, const IntVec& fine, in
   Array<double> s{};
   for (int a = 0; a < DIM; ++a) {
     coarse[a] = fine[a] >> 1;
-    s[a] = a == normal ? 0.0 : (fine[a] & 1) != 0 ? 1.0 : -1.0;
+    s[a] = (fine[a] & 1) != 0 ? 1.0 : -1.0;
   }
   const double* p = c.at(coarse);
-  if (normal < 0 || (fine[normal] & 1) == 0) return child_value(p, c.stride, s);
+  if (normal < 0) return child_value(p, c.stride, s);
+  if ((fine[normal] & 1) == 0) return child_value_across(p, c.stride, s, normal);
   const std::ptrdiff_t t = c.stride[normal];
-  const auto plane = [&](std::ptrdiff_t k) { return child_value(p + k * t, c.stride, s); };
+  const auto plane = [&](std::ptrdiff_t k) { return child_value_across(p + k * t, c.stride, s, normal); };
   // Between two planes of coarse faces: parabolas at the ends, where only three planes are known.
   if (fine[normal] < 0) return 0.375 * plane(0) + 0.75 * plane(1) - 0.125 * plane(2);
   if (fine[normal] > n) return 0.375 * plane(1) + 0.75 * plane(0) - 0.125 * plane(-1);

@@ -37,7 +37,7 @@ std::vector<double> Pieces::products(const std::vector<double>& v, std::span<con
 }
 
 double Pieces::norm(const std::vector<double>& v) const {
-  return std::sqrt(std::max(0.0, products(v, std::span(&v, 1)).front()));
+  return std::sqrt(products(v, std::span(&v, 1)).front());
 }
 
 GmresResult Gmres::solve(Vector& x, const Pieces& pieces, const GmresOptions& o,

@@ -33,7 +33,7 @@ inline void for_each_cell(const IntVec& lo, const IntVec& size, F&& f) {
 /// Calls f(b) for 0 <= b < count on all threads of this rank. f must touch nothing that another b writes.
 template <class F>
 inline void parallel_for(int count, F&& f) {
-#pragma omp parallel for schedule(dynamic, 1)
+#pragma omp parallel for schedule(dynamic, 1) if (count > 1)
   for (int b = 0; b < count; ++b) f(b);
 }
 

@@ -31,7 +31,6 @@ void FlowOptions::declare(io::Schema& schema) {
   io::Table& t = schema.table("flow", "motion of melt and crystals; without this table nothing moves");
   t.reals("velocity_um_s", velocity_um_s).unit("um/s").doc("uniform velocity, prescribed: nothing is solved; or velocity_W0_tau0");
   t.reals("velocity_W0_tau0", velocity_w0_tau0).unit("W0/tau0").doc("uniform velocity, prescribed: nothing is solved");
-  t.real("viscosity_um2_s", viscosity_um2_s).unit("um2/s").above(0).doc("kinematic viscosity of the melt");
   t.real("viscosity_ratio", viscosity_ratio).range(1, 1e9).doc("viscosity of the solid over that of the melt");
   t.choice("viscosity", viscosity, {{"h3", ViscosityLaw::h3}, {"h2", ViscosityLaw::h2}, {"h1", ViscosityLaw::h1},
                                     {"linear", ViscosityLaw::linear}})
@@ -106,7 +105,6 @@ void PrescribedFlow::report(Report& r) const {
 
 Flow::Flow(const FlowOptions& o, const Scales& s, std::vector<Seed>& crystals) : options_(o), scales_(s), crystals_(crystals) {
   const double time2 = s.tau0_s * s.tau0_s;
-  viscosity_ = o.viscosity_um2_s * s.tau0_s / (s.w0_um * s.w0_um);
   solutal_ = o.solutal_buoyancy ? o.solutal_expansion_per_wt * s.c_l_wt : 0.0;
   weight_ = o.solid_weight ? o.solid_density_ratio - 1 : 0.0;
   gravity_[DIM - 1] = -o.gravity_um_s2 * time2 / s.w0_um;
@@ -136,12 +134,12 @@ void Flow::attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) {
 
 void Flow::after_regrid() {
   solver_.reset();
-  if (!recalled_) {
-    due_ = true;
-    return;
-  }
-  // A restart: the faces beyond a block's own are not in the checkpoint.
+  const std::span<const amr::BlockIndex> leaves = mesh_->tree().leaves();
+  if (!recalled_ && !std::ranges::equal(leaves, leaves_)) due_ = true;  // blocks that only changed their rank change nothing
+  leaves_.assign(leaves.begin(), leaves.end());
   recalled_ = false;
+  // Faces that belong to others, and ghosts: neither a checkpoint nor a message holds them, and blocks to be refined need
+  // them.
   load();
   solver_->fill_state();
   store();
@@ -196,7 +194,7 @@ void Flow::set_viscosity() {
         double* out = phi - layout.interior();
         for (std::ptrdiff_t q = 0; q < layout.size(); ++q) out[q] = phi_of_psi(psi[q]);
       },
-      [&](double phi) { return viscosity_ * relative_viscosity(options_.viscosity, options_.viscosity_ratio, phi); });
+      [&](double phi) { return scales_.viscosity * relative_viscosity(options_.viscosity, options_.viscosity_ratio, phi); });
 }
 
 // Eqs. (5) and (6): what is known of the momentum at the end of the interval.

@@ -23,7 +23,6 @@ enum class Buoyancy : std::uint8_t { mixture, liquid };
 
 struct FlowOptions {
   std::optional<RealVec> velocity_um_s, velocity_w0_tau0;
-  double viscosity_um2_s = 5e5;
   double viscosity_ratio = 1e6;
   ViscosityLaw viscosity = ViscosityLaw::h3;
   Stress stress = Stress::symmetric;
@@ -32,7 +31,7 @@ struct FlowOptions {
   double solid_density_ratio = 2.7 / 2.45;
   bool solutal_buoyancy = true, solid_weight = true, inertia = true;
   Buoyancy buoyancy = Buoyancy::mixture;
-  double tolerance = 1e-5;
+  double tolerance = 1e-6;
   int max_iterations = 300;
   double courant = 0.5, max_interval_tau0 = 4, max_change = 0.05;
   std::array<std::optional<RealVec>, 6> wall_velocity_w0_tau0;  ///< those of z are read in 3D only
@@ -65,7 +64,7 @@ class PrescribedFlow : public Module {
 ///
 /// Backward Euler from one solution to the next, explicit for v.grad v. The flow is solved once in several steps of
 /// growth: at the latest when the melt has moved by `courant` cells, when the velocity is expected to have changed by
-/// `max_change`, and after every change of the mesh.
+/// `max_change`, and after every change of the tree.
 class Flow : public Module {
  public:
   Flow(const FlowOptions& options, const Scales& scales, std::vector<Seed>& crystals);
@@ -89,13 +88,14 @@ class Flow : public Module {
   FlowOptions options_;
   Scales scales_;
   std::vector<Seed>& crystals_;
-  double viscosity_, solutal_, weight_;  // nu_l; alpha_c c_l and rho_s/rho_l - 1, times the switches
+  double solutal_, weight_;  // alpha_c c_l and rho_s/rho_l - 1, times the switches
   RealVec gravity_{};  // W0/tau0^2
   amr::CellField psi_, c_, pressure_;
   amr::FaceField v_;
   amr::Mesh* mesh_ = nullptr;
   amr::GhostExchange* ghosts_ = nullptr;
   std::unique_ptr<StokesSolver> solver_;
+  std::vector<amr::BlockIndex> leaves_;  // of the tree that the velocity belongs to
   std::vector<double> before_;  // velocity before a solution, to see how fast it changes
   double last_ = 0, next_ = 0, interval_ = 0;
   double fastest_ = 0;

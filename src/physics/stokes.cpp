@@ -117,10 +117,31 @@ void StokesSolver::set_viscosity(const std::function<void(int, double*)>& phase,
         });
       }
   });
-  // Coarser grids: arithmetic means. Too stiff beside a solid, where the finer grids do the work; too soft a solid
-  // would let a coarse grid deform it, which costs 1/ratio more than it mends.
+  // Coarser grids: the square of the mean of square roots. The arithmetic mean makes a coarse cell that a solid only
+  // touches a solid itself, and the melt round it too stiff to flow; harmonic and geometric means let coarse grids bend
+  // solids. Iterations to .1 % of the speed of a disc (R = 40) and a cross (half width 10), ratio 1e6: arithmetic 14 and
+  // 38, geometric 12 and > 60, this one 11 and 36; at half the accuracy a third less.
+  const HierarchyField exact = viscosity_;
+  const auto with_cells = [&](int g, auto&& change) {
+    amr::parallel_for(hierarchy_.grid(g).size(), [&](int i) {
+      double* nu = viscosity_.at(g, i, 0);
+      const Layout& layout = hierarchy_.grid(g).layout;
+      amr::for_each_cell({}, filled(layout.n), [&](const IntVec& c) { nu[layout.offset(c)] = change(nu[layout.offset(c)]); });
+    });
+  };
+  const auto root = [](double x) { return std::sqrt(x); };
+  const auto square = [](double x) { return x * x; };
+  with_cells(0, root);
   for (int g = 0; g + 1 < hierarchy_.grids(); ++g) {
+    with_cells(g + 1, root);  // of the leaves; parents follow from finer cells
     hierarchy_.restrict_means(viscosity_, viscosity_, g);
+    with_cells(g, square);
+  }
+  with_cells(hierarchy_.grids() - 1, square);
+  for_leaves([&](int, int g, int i, double) {  // without the round-off of these
+    amr::copy_box(viscosity_.ref(g, i, 0), {}, exact.ref(g, i, 0), {}, filled(mesh_.layout().n));
+  });
+  for (int g = 0; g + 1 < hierarchy_.grids(); ++g) {
     const Grid& coarse = hierarchy_.grid(g + 1);
     const Layout& layout = coarse.layout;
     hierarchy_.exchange(viscosity_, g + 1, Layout::GHOSTS);

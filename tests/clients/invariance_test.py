@@ -68,6 +68,23 @@ radius_W0 = 6
 [flow]
 velocity_W0_tau0 = [4, 2]
 """),
+    # a growing crystal that sinks and turns, melt that flows
+    "2D flow": (dict(lines=0.5, steps=81, omega=0.4), """
+[mesh]
+dim = 2
+size_W0 = [64, 128]
+root_blocks = [1, 2]
+levels = 4
+block_cells = 8
+max_regrid_steps = 4
+[[seed]]
+position_W0 = [28, 80]
+radius_W0 = 8
+angle_deg = 20
+[flow]
+max_interval_tau0 = 0.4
+gravity_um_s2 = 3e9
+"""),
     "3D growth": (dict(lines=0.2, steps=41, omega=0.3), """
 [mesh]
 dim = 3

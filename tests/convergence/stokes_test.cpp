@@ -100,9 +100,10 @@ Settled settle(amr::Mesh& mesh, const Disc& disc, double ratio, physics::Viscosi
   return {r.iterations, core / cores, all / solid, r.divergence_max};
 }
 
+#if DENDRIFT_DIM == 2  // the numbers are for a disc
+
 // Direct sparse solutions of the staggered problem: h3 at ratio 1e5, R = 10, closed box of 80, nu_l = 1.
 TEST(Stokes, DiffuseDiscFallsAtTheKnownSpeed) {
-  if (DIM == 3) GTEST_SKIP() << "the number is for a disc";
   amr::Mesh uniform = box(80, 5, 16, 1, [](const amr::Block&) { return false; });
   const Settled s = settle(uniform, {10, filled_real(40)}, 1e5, physics::ViscosityLaw::h3);
   EXPECT_NEAR(s.core, 13.99, 0.01 * 13.99);
@@ -111,10 +112,12 @@ TEST(Stokes, DiffuseDiscFallsAtTheKnownSpeed) {
 }
 
 TEST(Stokes, LinearLawMakesTheDiscSlow) {
-  if (DIM == 3) GTEST_SKIP() << "the number is for a disc";
-  amr::Mesh uniform = box(80, 5, 16, 1, [](const amr::Block&) { return false; });
+  // At dx = .5: this law, which is steep in nu, is .4 % off there and 1.5 % at dx = 1.
+  amr::Mesh uniform = box(80, 10, 16, 1, [](const amr::Block&) { return false; });
   EXPECT_NEAR(settle(uniform, {10, filled_real(40)}, 1e6, physics::ViscosityLaw::linear).core, 3.296, 0.01 * 3.296);
 }
+
+#endif
 
 TEST(Stokes, RefinedMeshGivesTheUniformAnswer) {
   const double side = DIM == 2 ? 128 : 64;
@@ -147,9 +150,10 @@ TEST(Stokes, IterationsDoNotGrowWithTheRatio) {
     }
 }
 
+#if DENDRIFT_DIM == 2  // the solution is plane
+
 // No slip at the walls of the unit box: v = curl of [sin(pi x) sin(pi y)]^2, p = cos(pi x) sin(pi y), nu = 1.
 TEST(Stokes, OrderTwoAcrossLevels) {
-  if (DIM == 3) GTEST_SKIP() << "the solution is plane";
   const auto u = [](double x, double y) { return std::pow(std::sin(M_PI * x), 2) * std::sin(2 * M_PI * y); };
   const auto lap = [](double x, double y) {  // of u
     return M_PI * M_PI * std::sin(2 * M_PI * y) * (2 * std::cos(2 * M_PI * x) - 4 * std::pow(std::sin(M_PI * x), 2));
@@ -157,7 +161,8 @@ TEST(Stokes, OrderTwoAcrossLevels) {
   std::vector<double> errors;
   for (const int roots : {4, 8, 16}) {
     amr::Mesh mesh = box(1, roots, 8, 2, [](const amr::Block& b) {
-      return std::abs(b.lo[0] + 4 * b.dx - 0.4) < 0.25 && std::abs(b.lo[1] + 4 * b.dx - 0.5) < 0.2;
+      const double width = 8 * b.dx;
+      return b.lo[0] > 0.24 && b.lo[0] + width < 0.76 && b.lo[1] > 0.24 && b.lo[1] + width < 0.76;
     });
     StokesOptions o;
     o.tolerance = 1e-9;
@@ -185,6 +190,8 @@ TEST(Stokes, OrderTwoAcrossLevels) {
   EXPECT_GT(std::log2(errors[0] / errors[1]), 1.8) << errors[0] << " " << errors[1];
   EXPECT_GT(std::log2(errors[1] / errors[2]), 1.8) << errors[1] << " " << errors[2];
 }
+
+#endif
 
 }  // namespace
 }  // namespace dendrift::test

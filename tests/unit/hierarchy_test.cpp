@@ -12,7 +12,7 @@ namespace {
 using amr::Component;
 using amr::Grid;
 
-// Coarse faces of a parent with ghosts, and room for a child.
+// Coarse faces of a parent with ghosts, and room for a child. Faces beyond those that a parent fills are NaN.
 struct ParentAndChild {
   static constexpr int N = 8;
   amr::Layout layout{N};
@@ -26,7 +26,11 @@ struct ParentAndChild {
       parent[a].resize(static_cast<std::size_t>(layout.size()));
       child[a].resize(static_cast<std::size_t>(layout.size()));
       double* p = parent[a].data() + layout.interior();
-      for_all(layout, [&](const IntVec& c) { p[layout.offset(c)] = value(a, c); });
+      for_all(layout, [&](const IntVec& c) {
+        bool filled_by_parents = true;
+        for (int b = 0; b < DIM; ++b) filled_by_parents = filled_by_parents && c[b] >= -1 && c[b] <= N / 2 + (b == a ? 1 : 0);
+        p[layout.offset(c)] = filled_by_parents ? value(a, c) : std::numeric_limits<double>::quiet_NaN();
+      });
       fine[a] = amr::array_ref(child[a].data() + layout.interior(), layout);
       coarse[a] = amr::array_ref(static_cast<const double*>(p), layout);
     }
