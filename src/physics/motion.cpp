@@ -30,7 +30,8 @@ double dot(const Vector3& a, const Vector3& b) { return a[0] * b[0] + a[1] * b[1
 // The place of some solid relative to its crystal's centre, and its velocity.
 struct Sample {
   std::size_t crystal;
-  double weight;  // volume of solid
+  double volume;  // of solid
+  double weight;  // in the fit of a rigid motion
   Vector3 r, v;
 };
 
@@ -62,7 +63,10 @@ class Solid {
           const double* u = mesh_.faces(velocity_, a, b) + o;
           v[a] = 0.5 * (u[0] + u[layout.stride(a)]);
         }
-        Sample s{0, f * cell, {}, widened(v)};
+        // The interface is sheared by the melt: a spin read off all of it would be wrong by some percent. It counts
+        // only where there is no core at all.
+        constexpr double CORE = 0.95, FAINT = 1e-9;
+        Sample s{0, f * cell, f > CORE ? cell : FAINT * f * cell, {}, widened(v)};
         find_crystal(x, s);
         add(part.data() + s.crystal * width, s);
       });
@@ -112,9 +116,10 @@ Vector3 spin_of(const Vector3& l, const double* inertia) {
 
 void measure_motion(const amr::Mesh& mesh, amr::CellField psi, amr::FaceField velocity, std::vector<Seed>& crystals) {
   const Solid solid(mesh, psi, velocity, crystals);
-  constexpr std::size_t FIRST = 7, SECOND = 9, THIRD = 2;
+  constexpr std::size_t FIRST = 8, SECOND = 9, THIRD = 2;
   const std::vector<double> first = solid.sums(FIRST, [](double* sum, const Sample& s) {
     sum[0] += s.weight;
+    sum[7] += s.volume;
     for (std::size_t a = 0; a < 3; ++a) {
       sum[1 + a] += s.weight * s.r[a];
       sum[4 + a] += s.weight * s.v[a];
@@ -126,7 +131,7 @@ void measure_motion(const amr::Mesh& mesh, amr::CellField psi, amr::FaceField ve
   std::vector<Mean> mean(crystals.size());
   for (std::size_t g = 0; g < crystals.size(); ++g) {
     const double* sum = first.data() + g * FIRST;
-    crystals[g].volume = sum[0];
+    crystals[g].volume = sum[7];
     for (std::size_t a = 0; a < 3 && sum[0] > 0; ++a) {
       mean[g].r[a] = sum[1 + a] / sum[0];
       mean[g].v[a] = sum[4 + a] / sum[0];

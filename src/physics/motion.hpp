@@ -9,8 +9,8 @@
 
 namespace dendrift::physics {
 
-/// Sets velocity, spin, volume and nonrigidity of each crystal: the rigid motion that fits the velocity of its solid best,
-/// weighted with (1+phi)/2. Without a velocity (id -1) nothing moves. The solid nearest to a crystal's centre counts as its own. Collective; the same on all
+/// Sets velocity, spin, volume and nonrigidity of each crystal: the rigid motion that fits the velocity of its core
+/// (phi > .9) best, by least squares. Without a velocity (id -1) nothing moves. The solid nearest to a crystal's centre counts as its own. Collective; the same on all
 /// ranks and whatever their number.
 void measure_motion(const amr::Mesh& mesh, amr::CellField psi, amr::FaceField velocity, std::vector<Seed>& crystals);
 
