@@ -401,8 +401,8 @@ void Flow::add_inertia(int b) {
         const double* u = state.at(g, i, e) + q;
         const double speed = e == a ? v[q] : 0.25 * ((u[0] + u[s]) + (u[-t] + u[s - t]));
         const std::ptrdiff_t d = speed > 0 ? -s : s;  // towards where the fluid comes from
-        // The last face of a block has one face beyond it: first order there.
-        const bool wide = cell[e] >= 1 && cell[e] < layout.n - 1 + (speed > 0 ? 1 : 0);
+        // The high side of a block has one face beyond it: first order there, against the axis.
+        const bool wide = speed > 0 || cell[e] < layout.n;
         double gradient = v[q] - v[q + d];
         if (wide) {
           const double ahead = v[q - d] - v[q], behind = v[q] - v[q + d], further = v[q + d] - v[q + 2 * d];
