@@ -478,11 +478,11 @@ def sphere_array():
     """Drag of a simple cubic array of spheres over 6 pi mu a U, Zick & Homsy (1982)."""
     rows = []
     for fraction, reference in ((0.027, 2.008), (0.064, 2.810), (0.125, 4.292), (0.216, 7.442)):
-        for cells in (32, 64):
-            radius = cells * (0.75 * fraction / math.pi) ** (1 / 3)
-            r = FlowRun("sphere_array.toml", *flow_box([cells] * 3, [cells] * 3, 1, ([cells / 2] * 3, radius)))
+        for side, dx in ((32, 1), (32, 0.5), (64, 1), (96, 1)):
+            radius = side * (0.75 * fraction / math.pi) ** (1 / 3)
+            r = FlowRun("sphere_array.toml", *flow_box([side] * 3, [round(side / dx)] * 3, 1, ([side / 2] * 3, radius)))
             drag = r.drag() / (6 * math.pi * radius)
-            rows.append({"fraction": fraction, "R_W0": radius, "drag": drag, "reference": reference,
+            rows.append({"fraction": fraction, "R_W0": radius, "dx_W0": dx, "drag": drag, "reference": reference,
                          "error_percent": percent(drag, reference)} | r.cost())
     write("sphere_array", rows)
 

@@ -1,6 +1,8 @@
 // Sides that move or let melt through, periodic boxes, and seeds that are not round: what scenes of flow are made of.
 #include <gtest/gtest.h>
 
+#include <map>
+
 #include "physics/flow.hpp"
 #include "support/mesh_fixture.hpp"
 #include "support/scene.hpp"
@@ -182,6 +184,28 @@ TEST(Sides, PeriodicBoxKeepsItsMeanVelocity) {
   }
   EXPECT_GT(fastest[0], 0);
   EXPECT_NEAR(fastest[1], fastest[0], 0.01 * fastest[0]);  // settles, and is not accelerated
+}
+
+TEST(Inertia, DoesNotKnowTheBlocks) {
+  std::string sides;
+  for (const char* face : {"xlo", "xhi", "ylo", "yhi", "zlo", "zhi"})
+    if (DIM == 3 || face[0] != 'z') sides += std::string(face) + " = \"periodic\"\n";
+  const std::string start = std::string("initial_velocity_W0_tau0 = [0.2, -0.1") + (DIM == 3 ? ", 0.1]\n" : "]\n");
+  const std::string text = flow_scene(sides, start + "initial_vortex_W0_tau0 = 0.3\n");
+  const auto velocities = [&](int cells, int roots) {
+    const std::string n = std::to_string(roots);
+    Scene scene(text, {"mesh.block_cells=" + std::to_string(cells), "mesh.root_blocks=[" + n + "," + n + (DIM == 3 ? "," + n + "]" : "]"),
+                       "mesh.levels=1", "flow.inertia=true", "alloy.viscosity_um2_s=100", "flow.max_interval_tau0=0.3"});
+    scene.advance_to(3);
+    std::map<RealVec, double> v;
+    for (int a = 0; a < DIM; ++a)
+      for_faces(scene, a, [&](const RealVec& x, double value, double) { v[x] = value; });
+    return v;
+  };
+  const auto large = velocities(16, 1), small = velocities(8, 2);
+  ASSERT_EQ(large.size(), small.size());
+  ASSERT_EQ(large.size(), static_cast<std::size_t>(DIM * volume(filled(16))));
+  for (const auto& [x, v] : large) EXPECT_NEAR(v, small.at(x), 1e-6) << x[0] << " " << x[1];
 }
 
 TEST(Seeds, EllipseHasTheSignedDistanceOfItsSurface) {
