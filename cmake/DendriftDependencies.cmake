@@ -9,7 +9,7 @@ find_package(fmt REQUIRED)
 find_package(CLI11 REQUIRED)
 find_package(TomlPlusPlus REQUIRED)
 find_package(spdlog QUIET)
-find_package(Eigen3 3.3 QUIET NO_MODULE)
+find_package(Eigen3 3.3 REQUIRED NO_MODULE)
 find_package(HYPRE QUIET)
 
 add_library(dendrift_libraries INTERFACE)
@@ -18,11 +18,11 @@ target_compile_features(dendrift_libraries INTERFACE cxx_std_20)
 target_compile_definitions(dendrift_libraries INTERFACE OMPI_SKIP_MPICXX MPICH_SKIP_MPICXX)
 target_link_libraries(dendrift_libraries INTERFACE
   MPI::MPI_C OpenMP::OpenMP_CXX HDF5Parallel::HDF5 METIS::METIS
-  fmt::fmt CLI11::CLI11 tomlplusplus::tomlplusplus)
+  Eigen3::Eigen fmt::fmt CLI11::CLI11 tomlplusplus::tomlplusplus)
 
 # Without these the build goes on; DENDRIFT_HAVE_<NAME> tells the code what it has.
 set(DENDRIFT_OPTIONAL_LIBRARIES "")
-foreach(row IN ITEMS "HYPRE HYPRE::HYPRE" "Eigen3 Eigen3::Eigen" "spdlog spdlog::spdlog")
+foreach(row IN ITEMS "HYPRE HYPRE::HYPRE" "spdlog spdlog::spdlog")
   string(REPLACE " " ";" row "${row}")
   list(GET row 0 package)
   list(GET row 1 target)

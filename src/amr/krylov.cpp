@@ -41,17 +41,13 @@ double Pieces::norm(const std::vector<double>& v) const {
 }
 
 GmresResult Gmres::solve(Vector& x, const Pieces& pieces, const GmresOptions& o,
-                         const std::function<double(const Vector& x, double residual)>& target) {
+                         const std::function<double(const Vector& x)>& size) {
   GmresResult result;
   const std::size_t n = pieces.size();
   const int m = o.restart;
   if (basis_.size() < at(m + 1)) basis_.resize(at(m + 1));
   for (Vector& v : basis_)
     if (v.size() != n) v.assign(n, 0.0);
-  const auto axpy = [&](double a, const Vector& u, Vector& v) {
-#pragma omp parallel for simd
-    for (std::size_t q = 0; q < n; ++q) v[q] += a * u[q];
-  };
   const auto scale = [&](double a, Vector& v) {
 #pragma omp parallel for simd
     for (std::size_t q = 0; q < n; ++q) v[q] *= a;
@@ -73,12 +69,21 @@ GmresResult Gmres::solve(Vector& x, const Pieces& pieces, const GmresOptions& o,
     precondition(basis_[0]);
     const double beta = pieces.norm(basis_[0]);
     result.residual = beta;
-    const double goal = target(x, beta);
-    result.converged = beta <= goal;
+    const double before = size(x);
+    result.converged = beta <= o.tolerance * before;
     if (result.converged || result.iterations >= o.max_iterations || !std::isfinite(beta)) return result;
     scale(1 / beta, basis_[0]);
     std::vector<std::vector<double>> h;  // columns of the upper triangle after rotation
-    std::vector<double> c, s, g{beta};
+    std::vector<double> c, s, g{beta}, y;
+    // Coefficients of the correction in the basis of the first k vectors.
+    const auto solve_triangle = [&](int k) {
+      y.assign(at(k), 0.0);
+      for (int i = k - 1; i >= 0; --i) {
+        double sum = g[at(i)];
+        for (int j = i + 1; j < k; ++j) sum -= h[at(j)][at(i)] * y[at(j)];
+        y[at(i)] = sum / h[at(i)][at(i)];
+      }
+    };
     int k = 0;
     for (; k < m && result.iterations < o.max_iterations; ++k) {
       ++result.iterations;
@@ -88,15 +93,15 @@ GmresResult Gmres::solve(Vector& x, const Pieces& pieces, const GmresOptions& o,
       std::vector<double> column(at(k + 2), 0.0);
       // Classical Gram-Schmidt, one sum over the ranks instead of k; again where so much was taken off that round-off
       // would show.
-      double length = 0, before = 0;
+      double length = 0, whole = 0;
       constexpr double LOST = 1e-2;
       do {
         const std::vector<double> p = pieces.products(w, std::span(basis_.data(), at(k + 2)));
-        before = std::sqrt(p[at(k + 1)]);
+        whole = std::sqrt(p[at(k + 1)]);
         subtract(p, k + 1, w);
         for (int j = 0; j <= k; ++j) column[at(j)] += p[at(j)];
         length = pieces.norm(w);
-      } while (length < LOST * before && length > 1e-13 * beta);
+      } while (length < LOST * whole && length > 1e-13 * beta);
       column[at(k + 1)] = length;
       for (int j = 0; j < k; ++j) {
         const double a = column[at(j)], b = column[at(j + 1)];
@@ -110,19 +115,20 @@ GmresResult Gmres::solve(Vector& x, const Pieces& pieces, const GmresOptions& o,
       h.push_back(std::move(column));
       g.push_back(-s[at(k)] * g[at(k)]);
       g[at(k)] *= c[at(k)];
+      solve_triangle(k + 1);
+      double correction = 0;
+      for (const double q : y) correction += q * q;
+      // From rest the solution is no larger than the correction; a warm start needs no correction to know its size.
+      const double goal = o.tolerance * std::max(before, std::sqrt(correction));
       if (std::abs(g[at(k + 1)]) <= goal || length <= 1e-14 * beta) {
         ++k;
         break;
       }
       scale(1 / length, w);
     }
-    std::vector<double> y(at(k));
-    for (int i = k - 1; i >= 0; --i) {
-      double sum = g[at(i)];
-      for (int j = i + 1; j < k; ++j) sum -= h[at(j)][at(i)] * y[at(j)];
-      y[at(i)] = sum / h[at(i)][at(i)];
-    }
-    for (int j = 0; j < k; ++j) axpy(y[at(j)], basis_[at(j)], x);
+    solve_triangle(k);
+    for (double& q : y) q = -q;
+    subtract(y, k, x);
   }
 }
 

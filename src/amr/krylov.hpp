@@ -24,6 +24,7 @@ struct Pieces {
 };
 
 struct GmresOptions {
+  double tolerance = 1e-6;  ///< norm of the preconditioned residual over that of the solution
   int max_iterations = 200;
   int restart = 50;
 };
@@ -42,9 +43,9 @@ class Gmres {
   std::function<void(const Vector&, Vector&)> residual, apply;
   std::function<void(Vector&)> precondition;
 
-  /// `target(x, residual)`: the norm of the preconditioned residual to be reached, told the one that x has.
+  /// `size(x)`: the norm that the residual is measured against.
   GmresResult solve(Vector& x, const Pieces& pieces, const GmresOptions& options,
-                    const std::function<double(const Vector& x, double residual)>& target);
+                    const std::function<double(const Vector& x)>& size);
 
  private:
   std::vector<Vector> basis_;

@@ -9,9 +9,13 @@ namespace {
 
 std::size_t at(int i) { return static_cast<std::size_t>(i); }
 
-// kappa along each axis as a strided array: below[q] is the link under place q, below[q + s] the one over it.
+// What a sweep is compiled for: kappa constant, variable, or variable and coupled, for the component along each axis.
+enum Kind : int { COUPLED, CONSTANT = DIM, VARIABLE };
+
+// kappa along each axis as a strided array: kappa[q] is the link under place q, kappa[q + s] the one over it.
 struct Operator {
   Array<const double*> kappa{};
+  Array<const double*> other{};  // coupled: the component along each axis, null for our own
   Array<std::ptrdiff_t> stride{};
   Array<double> factor{};  // of kappa, over dx^2
   double sigma = 0;
@@ -19,14 +23,19 @@ struct Operator {
   [[gnu::always_inline]] double below(int a, std::ptrdiff_t q) const { return kappa[a] == nullptr ? factor[a] : factor[a] * kappa[a][q]; }
 };
 
-// A x at place q. Constant: all kappa are the factors alone.
-template <bool Constant>
+// A x at place q.
+template <int K>
 [[gnu::always_inline]] inline double apply(const Operator& o, const double* x, std::ptrdiff_t q) {
   double sum = o.sigma * x[q];
   for (int a = 0; a < DIM; ++a) {
     const std::ptrdiff_t s = o.stride[a];
-    if constexpr (Constant) {
+    if (K == CONSTANT) {
       sum += o.factor[a] * (2 * x[q] - x[q - s] - x[q + s]);
+    } else if (K < CONSTANT && a != K) {
+      const double* u = o.other[a];
+      const std::ptrdiff_t t = o.stride[K % DIM];
+      sum += o.factor[a] * (o.kappa[a][q] * ((x[q] - x[q - s]) + (u[q] - u[q - t])) -
+                            o.kappa[a][q + s] * ((x[q + s] - x[q]) + (u[q + s] - u[q + s - t])));
     } else {
       sum += o.factor[a] * (o.kappa[a][q] * (x[q] - x[q - s]) + o.kappa[a][q + s] * (x[q] - x[q + s]));
     }
@@ -34,18 +43,51 @@ template <bool Constant>
   return sum;
 }
 
-}  // namespace
+// The sweeps below take whole slabs of memory, ghosts between the rows included: long loops without epilogues. What
+// they leave in those ghosts is never read, or zero times something.
 
-Multigrid::Multigrid(Hierarchy& hierarchy, std::vector<Component> components, std::vector<Links> links,
-                     const HierarchyField& coefficients, MultigridOptions options)
-    : h_(hierarchy), coefficients_(coefficients), options_(options),
-      x_(hierarchy, components), rhs_(hierarchy, components), step_(hierarchy, components),
-      residual_(hierarchy, components), inverse_(hierarchy, components) {
-  prepare(std::move(links));
+// d = weight D^-1 (r - A x) + momentum d
+template <int K>
+void chebyshev_step(Operator o, const double* x, const double* r, const double* inverse, double* __restrict d,
+                    std::ptrdiff_t begin, std::ptrdiff_t end, double weight, double momentum) {
+#pragma omp simd
+  for (std::ptrdiff_t q = begin; q < end; ++q) d[q] = weight * inverse[q] * (r[q] - apply<K>(o, x, q)) + momentum * d[q];
+}
+
+template <int K>
+void residual_sweep(Operator o, const double* x, const double* b, double* __restrict r, std::ptrdiff_t begin, std::ptrdiff_t end) {
+#pragma omp simd
+  for (std::ptrdiff_t q = begin; q < end; ++q) r[q] = b[q] - apply<K>(o, x, q);
 }
 
 template <class F>
-void Multigrid::with_operator(int g, int i, int c, F&& f) const {
+void for_each_cell_of(const Range& box, F&& f) {
+  for_each_cell(box.lo, box.size, f);
+}
+
+// f(first, past the last place) of each contiguous piece that covers a box.
+template <class F>
+void for_each_slab(const Layout& layout, const Range& box, F&& f) {
+  IntVec first = box.lo, last = box.lo;
+  for (int a = 0; a < 2; ++a) last[a] += box.size[a] - 1;
+  const int planes = DIM == 2 ? 1 : box.size[DIM - 1];
+  for (int k = 0; k < planes; ++k) {
+    f(layout.offset(first), layout.offset(last) + 1);
+    ++first[DIM - 1];
+    ++last[DIM - 1];
+  }
+}
+
+}  // namespace
+
+Multigrid::Multigrid(Hierarchy& hierarchy, std::vector<Component> components, const HierarchyField& coefficients,
+                     MultigridOptions options)
+    : h_(hierarchy), coefficients_(coefficients), options_(options),
+      x_(hierarchy, components), rhs_(hierarchy, components), step_(hierarchy, components),
+      residual_(hierarchy, components), inverse_(hierarchy, components) {}
+
+template <class F>
+void Multigrid::with_operator(const HierarchyField& x, int g, int i, int c, F&& f) const {
   const Links& l = links_[at(c)];
   const Grid& grid = h_.grid(g);
   Operator o;
@@ -58,15 +100,21 @@ void Multigrid::with_operator(int g, int i, int c, F&& f) const {
     constant = false;
     o.kappa[a] = coefficients_.at(g, i, l.along[a].field) - l.along[a].below * o.stride[a];
   }
-  if (constant) {
-    f(o, std::true_type{});
+  if (l.coupled) {
+    for (int a = 0; a < DIM; ++a)
+      if (a != c) o.other[a] = x.at(g, i, a);
+    if (c == 0) f(o, std::integral_constant<int, COUPLED>{});
+    if (c == 1) f(o, std::integral_constant<int, COUPLED + 1>{});
+    if (DIM == 3 && c == 2) f(o, std::integral_constant<int, COUPLED + DIM - 1>{});
+  } else if (constant) {
+    f(o, std::integral_constant<int, CONSTANT>{});
   } else {
-    f(o, std::false_type{});
+    f(o, std::integral_constant<int, VARIABLE>{});
   }
 }
 
 template <class F>
-void Multigrid::rows(int g, int, int, const Range& box, F&& f) const {
+void Multigrid::rows(int g, const Range& box, F&& f) const {
   const Layout& layout = h_.grid(g).layout;
   for_each_row(box.size, [&](const IntVec& row) {
     IntVec q = row;
@@ -80,17 +128,78 @@ void Multigrid::prepare(std::vector<Links> links) {
   for (int g = 0; g < h_.grids(); ++g)
     parallel_for(h_.grid(g).size(), [&](int i) {
       for (int c = 0; c < x_.components(); ++c)
-        with_operator(g, i, c, [&](const Operator& o, auto) {
+        with_operator(x_, g, i, c, [&](const Operator& o, auto) {
           double* inverse = inverse_.at(g, i, c);
-          rows(g, i, c, h_.unknowns(g, i, x_.component(c), false), [&](std::ptrdiff_t q0, int count) {
+          rows(g, h_.unknowns(g, i, x_.component(c), false), [&](std::ptrdiff_t q0, int count) {
             for (std::ptrdiff_t q = q0; q < q0 + count; ++q) {
               double d = o.sigma;
-              for (int a = 0; a < DIM; ++a) d += o.below(a, q) + o.below(a, q + o.stride[a]);
+              for (int a = 0; a < DIM; ++a)
+                d += (o.other[a] != nullptr ? 2 : 1) * (o.below(a, q) + o.below(a, q + o.stride[a]));
               inverse[q] = 1 / d;
             }
           });
         });
     });
+  prepare_bottom();
+}
+
+// f(place in the array, number) for the unknowns of the coarsest grid, all of which are rank 0's.
+template <class F>
+void Multigrid::for_bottom(F&& f) const {
+  const int g = h_.grids() - 1;
+  int number = 0;
+  for (int i = 0; i < h_.grid(g).size(); ++i)
+    for (int c = 0; c < x_.components(); ++c)
+      for_each_cell_of(h_.unknowns(g, i, x_.component(c), false), [&](const IntVec& q) {
+        f(i, c, h_.grid(g).layout.offset(q), number++);
+      });
+}
+
+// Ghosts that have been filled from the numbers of the unknowns tell where the links lead, and with which sign.
+void Multigrid::prepare_bottom() {
+  const int g = h_.grids() - 1;
+  x_.clear(g);
+  int size = 0;
+  for_bottom([&](int i, int c, std::ptrdiff_t q, int number) {
+    x_.at(g, i, c)[q] = number + 1;
+    size = number + 1;
+  });
+  h_.exchange(x_, g, 1);
+  if (size == 0) return;
+  std::vector<SparseSolver::Entry> entries;
+  for_bottom([&](int i, int c, std::ptrdiff_t q, int row) {
+    const auto add = [&](const double* number, std::ptrdiff_t place, double value) {
+      const double k = number[place];
+      if (k != 0) entries.push_back({row, static_cast<int>(std::abs(k)) - 1, std::copysign(value, value * k)});
+    };
+    with_operator(x_, g, i, c, [&](const Operator& o, auto) {
+      const double* x = x_.at(g, i, c);
+      add(x, q, o.sigma);
+      for (int a = 0; a < DIM; ++a) {
+        const std::ptrdiff_t s = o.stride[a];
+        for (const int side : {0, 1}) {
+          const double link = o.below(a, q + side * s);
+          add(x, q, link);
+          add(x, q + (2 * side - 1) * s, -link);
+          if (o.other[a] == nullptr) continue;
+          const double sign = side == 0 ? link : -link;
+          add(o.other[a], q + side * s, sign);
+          add(o.other[a], q + side * s - o.stride[c], -sign);
+        }
+      }
+    });
+  });
+  bottom_.factorize(size, entries);
+}
+
+void Multigrid::solve_bottom() {
+  const int g = h_.grids() - 1;
+  x_.clear(g);
+  bottom_values_.resize(at(bottom_.size()));
+  if (bottom_.size() == 0) return;
+  for_bottom([&](int i, int c, std::ptrdiff_t q, int k) { bottom_values_[at(k)] = rhs_.at(g, i, c)[q]; });
+  bottom_.solve(bottom_values_);
+  for_bottom([&](int i, int c, std::ptrdiff_t q, int k) { x_.at(g, i, c)[q] = bottom_values_[at(k)]; });
 }
 
 // Chebyshev iteration with the diagonal as preconditioner: a few multiply-adds a cell and step, no colours.
@@ -103,34 +212,32 @@ void Multigrid::smooth(int g, int steps, double lowest, bool from_zero) {
     rho = next_rho;
     const bool zero = from_zero && k == 0;
     if (!zero) h_.exchange(x_, g, 1);
+    const Layout& layout = h_.grid(g).layout;
     parallel_for(h_.grid(g).size(), [&](int i) {
       for (int c = 0; c < x_.components(); ++c) {
-        const Range box = h_.unknowns(g, i, x_.component(c), false);
         double *x = x_.at(g, i, c), *d = step_.at(g, i, c);
         const double *r = rhs_.at(g, i, c), *inverse = inverse_.at(g, i, c);
+        const Range box = h_.unknowns(g, i, x_.component(c), false);
         if (zero) {
-          rows(g, i, c, box, [&](std::ptrdiff_t q0, int count) {
+          for_each_slab(layout, box, [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
 #pragma omp simd
-            for (std::ptrdiff_t q = q0; q < q0 + count; ++q) x[q] = d[q] = weight * inverse[q] * r[q];
+            for (std::ptrdiff_t q = begin; q < end; ++q) x[q] = d[q] = weight * inverse[q] * r[q];
           });
-          continue;
+        } else {
+          with_operator(x_, g, i, c, [&](const Operator& o, auto kind) {
+            for_each_slab(layout, box, [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
+              chebyshev_step<decltype(kind)::value>(o, x, r, inverse, d, begin, end, weight, momentum);
+            });
+          });
         }
-        with_operator(g, i, c, [&](const Operator& o, auto constant) {
-          rows(g, i, c, box, [&](std::ptrdiff_t q0, int count) {
-            if (momentum == 0) {
+      }
+      if (zero) return;
+      for (int c = 0; c < x_.components(); ++c) {  // after all: components may be coupled
+        double* x = x_.at(g, i, c);
+        const double* d = step_.at(g, i, c);
+        for_each_slab(layout, h_.unknowns(g, i, x_.component(c), false), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
 #pragma omp simd
-              for (std::ptrdiff_t q = q0; q < q0 + count; ++q)
-                d[q] = weight * inverse[q] * (r[q] - apply<decltype(constant)::value>(o, x, q));
-            } else {
-#pragma omp simd
-              for (std::ptrdiff_t q = q0; q < q0 + count; ++q)
-                d[q] = weight * inverse[q] * (r[q] - apply<decltype(constant)::value>(o, x, q)) + momentum * d[q];
-            }
-          });
-        });
-        rows(g, i, c, box, [&](std::ptrdiff_t q0, int count) {
-#pragma omp simd
-          for (std::ptrdiff_t q = q0; q < q0 + count; ++q) x[q] += d[q];
+          for (std::ptrdiff_t q = begin; q < end; ++q) x[q] += d[q];
         });
       }
     });
@@ -156,10 +263,9 @@ void Multigrid::residual(int g) {
           ++box.size[a];
         }
       }
-      with_operator(g, i, c, [&](const Operator& o, auto constant) {
-        rows(g, i, c, box, [&](std::ptrdiff_t q0, int count) {
-#pragma omp simd
-          for (std::ptrdiff_t q = q0; q < q0 + count; ++q) r[q] = b[q] - apply<decltype(constant)::value>(o, x, q);
+      with_operator(x_, g, i, c, [&](const Operator& o, auto kind) {
+        for_each_slab(h_.grid(g).layout, box, [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
+          residual_sweep<decltype(kind)::value>(o, x, b, r, begin, end);
         });
       });
     }
@@ -182,12 +288,12 @@ void Multigrid::couple(int g) {
     }
     if (!border) return;
     for (int c = 0; c < x_.components(); ++c)
-      with_operator(g + 1, i, c, [&](const Operator& o, auto constant) {
+      with_operator(step_, g + 1, i, c, [&](const Operator& o, auto kind) {
         const double* x = step_.at(g + 1, i, c);
         double* r = rhs_.at(g + 1, i, c);
-        rows(g + 1, i, c, h_.unknowns(g + 1, i, x_.component(c), true), [&](std::ptrdiff_t q0, int count) {
+        rows(g + 1, h_.unknowns(g + 1, i, x_.component(c), true), [&](std::ptrdiff_t q0, int count) {
 #pragma omp simd
-          for (std::ptrdiff_t q = q0; q < q0 + count; ++q) r[q] -= apply<decltype(constant)::value>(o, x, q);
+          for (std::ptrdiff_t q = q0; q < q0 + count; ++q) r[q] -= apply<decltype(kind)::value>(o, x, q);
         });
       });
   });
@@ -204,8 +310,7 @@ void Multigrid::cycle() {
     h_.restrict_weighted(residual_, rhs_, g);
     if (g + 1 < h_.levels()) couple(g);
   }
-  x_.clear(last);
-  smooth(last, options_.bottom_steps, 0.5 * options_.bottom_steps * options_.bottom_steps, true);
+  solve_bottom();
   for (int g = last - 1; g >= 0; --g) {
     h_.exchange(x_, g + 1, Layout::GHOSTS);
     h_.prolong_add(x_, g);

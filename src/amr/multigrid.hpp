@@ -3,10 +3,10 @@
 /// component with its own centring. Used as a preconditioner, so sides count as homogeneous.
 #pragma once
 
-#include <functional>
 #include <vector>
 
 #include "amr/hierarchy.hpp"
+#include "amr/sparse_solver.hpp"
 
 namespace dendrift::amr {
 
@@ -20,20 +20,22 @@ struct Links {
     double factor = 1;
   };
   Array<Along> along{};
+  /// Component a of a vector whose components are all here and carried by faces: each link across a, of the difference
+  /// d_b x_a, acts on d_b x_a + d_a x_b instead, as the symmetric viscous stress does.
+  bool coupled = false;
 };
 
 struct MultigridOptions {
-  int smoothings = 2;       ///< Chebyshev steps before and after the coarser grid
-  double lowest = 4;        ///< they act on eigenvalues from 2/lowest to 2 of the diagonally scaled operator
-  int bottom_steps = 40;    ///< on the coarsest grid
+  int smoothings = 4;       ///< Chebyshev steps before and after the coarser grid
+  double lowest = 8;        ///< they act on eigenvalues from 2/lowest to 2 of the diagonally scaled operator
 };
 
 class Multigrid {
  public:
-  Multigrid(Hierarchy& hierarchy, std::vector<Component> components, std::vector<Links> links,
-            const HierarchyField& coefficients, MultigridOptions options = {});
+  Multigrid(Hierarchy& hierarchy, std::vector<Component> components, const HierarchyField& coefficients,
+            MultigridOptions options = {});
 
-  /// Call when the coefficients or sigma have changed.
+  /// Call before the first cycle, and when the coefficients or sigma have changed.
   void prepare(std::vector<Links> links);
   /// Right-hand side on the leaves (the rest is overwritten); zero where nothing is unknown.
   HierarchyField& rhs() { return rhs_; }
@@ -45,17 +47,23 @@ class Multigrid {
   void smooth(int g, int steps, double lowest, bool from_zero);
   void residual(int g);
   void couple(int g);
+  void prepare_bottom();
+  void solve_bottom();
+  template <class F>
+  void for_bottom(F&& f) const;
   /// f(places of a row of unknowns, its length) for one component of one node.
   template <class F>
-  void rows(int g, int i, int c, const Range& box, F&& f) const;
+  void rows(int g, const Range& box, F&& f) const;
   template <class F>
-  void with_operator(int g, int i, int c, F&& f) const;
+  void with_operator(const HierarchyField& x, int g, int i, int c, F&& f) const;
 
   Hierarchy& h_;
   const HierarchyField& coefficients_;
   std::vector<Links> links_;
   MultigridOptions options_;
   HierarchyField x_, rhs_, step_, residual_, inverse_;
+  SparseSolver bottom_;
+  std::vector<double> bottom_values_;
 };
 
 }  // namespace dendrift::amr

@@ -48,12 +48,12 @@ StokesSolver::StokesSolver(const amr::Mesh& mesh, const StokesOptions& options)
       image_(hierarchy_, components_), viscosity_(hierarchy_, std::vector<Component>(1 + EDGES)),
       pressure_(hierarchy_, {components_[DIM]}) {
   for (const amr::Side s : mesh.shape().sides) closed_ = closed_ && s != amr::Side::open;
-  velocity_cycle_ = std::make_unique<amr::Multigrid>(hierarchy_, velocities(components_), velocity_links(0), viscosity_);
+  velocity_cycle_ = std::make_unique<amr::Multigrid>(hierarchy_, velocities(components_), viscosity_);
   amr::Links laplacian;
   for (auto& along : laplacian.along) along.factor = 1;
   pressure_cycle_ = std::make_unique<amr::Multigrid>(hierarchy_, std::vector<Component>{components_[DIM]},
-                                                     std::vector<amr::Links>{laplacian}, viscosity_,
-                                                     amr::MultigridOptions{.smoothings = 1});
+                                                     viscosity_, amr::MultigridOptions{.smoothings = 1});
+  pressure_cycle_->prepare({laplacian});
   gmres_.residual = [this](const Vector& x, Vector& r) {
     unpack(x, state_);
     hierarchy_.make_composite(state_, 1, false);
@@ -85,6 +85,7 @@ std::vector<amr::Links> StokesSolver::velocity_links(double sigma) const {
   std::vector<amr::Links> links(DIM);
   for (int a = 0; a < DIM; ++a) {
     links[at(a)].sigma = sigma;
+    links[at(a)].coupled = options_.stress == Stress::symmetric;
     for (int b = 0; b < DIM; ++b) {
       amr::Links::Along& along = links[at(a)].along[b];
       along.field = a == b ? 0 : edge_component(a, b);
@@ -117,10 +118,9 @@ void StokesSolver::set_viscosity(const std::function<void(int, double*)>& phase,
         });
       }
   });
-  // Coarser grids: the square of the mean of square roots. The arithmetic mean makes a coarse cell that a solid only
-  // touches a solid itself, and the melt round it too stiff to flow; harmonic and geometric means let coarse grids bend
-  // solids. Iterations to .1 % of the speed of a disc (R = 40) and a cross (half width 10), ratio 1e6: arithmetic 14 and
-  // 38, geometric 12 and > 60, this one 11 and 36; at half the accuracy a third less.
+  // Coarser grids: the square of the mean of square roots. Iterations from rest to 1e-5, ratio 1e6, for a disc (R = 80),
+  // a cross (half width 10) and a seed (R = 10) in a wide box: this one 22, 20, 20; arithmetic means 22, 19, 26;
+  // geometric ones bend solids (27, 36 at 1e-4 already).
   const HierarchyField exact = viscosity_;
   const auto with_cells = [&](int g, auto&& change) {
     amr::parallel_for(hierarchy_.grid(g).size(), [&](int i) {
@@ -371,14 +371,10 @@ StokesResult StokesSolver::solve(double sigma) {
     }
     return pieces_.norm(v_only);
   };
-  // From rest the first preconditioned residual is itself a guess of the solution.
-  const auto target = [&](const Vector& now, double residual) {
-    const double v = speed(now);
-    return options_.tolerance * (v > 0 ? v : residual);
-  };
   amr::GmresOptions o;
   o.max_iterations = options_.max_iterations;
-  const amr::GmresResult g = gmres_.solve(x, pieces_, o, target);
+  o.tolerance = options_.tolerance;
+  const amr::GmresResult g = gmres_.solve(x, pieces_, o, speed);
   unpack(x, state_);
   fill_state();
   StokesResult result;

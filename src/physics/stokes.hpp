@@ -32,8 +32,7 @@ struct StokesResult {
 
 /// Solver for one mesh; build it anew when the mesh changes. Components of its fields: the velocities, then the pressure.
 ///
-/// GMRES on the whole system. Preconditioner: one multigrid cycle for each component of the velocity on the diagonal
-/// blocks of the viscous operator, and nu + sigma (-Lap)^-1 for the pressure (Cahouet & Chabard, Int. J. Numer. Methods
+/// GMRES on the whole system. Preconditioner: one multigrid cycle on the viscous operator, all components together, and nu + sigma (-Lap)^-1 for the pressure (Cahouet & Chabard, Int. J. Numer. Methods
 /// Fluids 8, 869 (1988)), the inverse Laplacian being one cycle as well.
 class StokesSolver {
  public:
