@@ -63,7 +63,7 @@ def against(*keys, digits=3):
 
 
 def ellipse_in_shear(r):
-    return [num(r["side_over_long_axis"], 2), r["R_W0"], num(r["T_gamma"], 3), r["reference"], num(r["error_percent"], 2) + " %",
+    return [num(r["side_over_long_axis"], 2), r["tolerance"], num(r["T_gamma"], 3), r["reference"], num(r["error_percent"], 2) + " %",
             num(r["slowest_spin"], 4), num(r["fastest_spin"], 4)]
 
 
