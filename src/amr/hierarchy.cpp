@@ -13,6 +13,7 @@ namespace {
 constexpr int TAG = 120;
 constexpr int G = Layout::GHOSTS;
 constexpr int COARSEST_CELLS = 2;
+constexpr std::int64_t DIRECT_CELLS = 600;  // that the last grid may have
 
 std::size_t at(int i) { return static_cast<std::size_t>(i); }
 
@@ -131,6 +132,8 @@ void Hierarchy::add_level_grids() {
   for (int l = 0; l < levels_; ++l) {
     of_level(l).layout = mesh_.layout();
     of_level(l).dx = mesh_.shape().dx(l);
+    of_level(l).extent = mesh_.shape().root_blocks;
+    for (int& e : of_level(l).extent) e <<= l;
   }
   for (int leaf = 0; leaf < tree.size(); ++leaf) {
     Grid::Node n;
@@ -158,27 +161,50 @@ void Hierarchy::add_level_grids() {
   }
 }
 
-// So few cells that one rank solves them faster alone than all by messages.
+// So few cells that one rank solves them faster alone than all by messages: roots of fewer and fewer cells, then groups
+// of roots as if the tree went on. Not further than a direct solution asks for: the coarser the last grid, the less it
+// knows of small solids.
 void Hierarchy::add_grids_beneath() {
-  while (grids_.back().layout.n / 2 >= COARSEST_CELLS) {
-    Grid g = grids_.back();
-    for (int i = 0; i < static_cast<int>(g.nodes.size()); ++i) {
-      grids_.back().nodes[at(i)].parent = i;
-      g.nodes[at(i)].leaf = -1;
-      g.nodes[at(i)].owner = 0;
-      g.nodes[at(i)].parent = -1;
+  const auto halved = [](Grid g) {
+    for (Grid::Node& n : g.nodes) {
+      n.leaf = n.parent = -1;
+      n.owner = 0;
+      n.place = {};
     }
-    g.layout.n /= 2;
     g.dx *= 2;
+    return g;
+  };
+  while (grids_.back().layout.n / 2 >= COARSEST_CELLS) {
+    Grid g = halved(grids_.back());
+    for (std::size_t i = 0; i < g.nodes.size(); ++i) grids_.back().nodes[i].parent = static_cast<int>(i);
+    g.layout.n /= 2;
+    grids_.push_back(std::move(g));
+  }
+  const auto even = [](int e) { return e % 2 == 0; };
+  const auto cells = [](const Grid& g) { return volume(g.extent) * volume(filled(g.layout.n)); };
+  while (cells(grids_.back()) > DIRECT_CELLS && std::ranges::all_of(grids_.back().extent, even)) {
+    Grid& fine = grids_.back();
+    Grid g = halved(fine);
+    g.nodes.clear();
+    std::unordered_map<std::uint64_t, int> number;
+    for (Grid::Node& n : fine.nodes) {
+      Grid::Node group;
+      for (int a = 0; a < DIM; ++a) {
+        group.index.coord[a] = n.index.coord[a] / 2;
+        n.place[a] = n.index.coord[a] % 2 * (fine.layout.n / 2);
+      }
+      const auto [found, is_new] = number.emplace(key(group.index.coord), static_cast<int>(g.nodes.size()));
+      n.parent = found->second;
+      if (is_new) g.nodes.push_back(group);
+    }
+    for (int& e : g.extent) e /= 2;
     grids_.push_back(std::move(g));
   }
 }
 
 void Hierarchy::connect(int g) {
   Grid& grid = grids_[at(g)];
-  const int level = std::max(0, levels_ - 1 - g);
-  IntVec extent = mesh_.shape().root_blocks;
-  for (int& e : extent) e <<= level;
+  const IntVec& extent = grid.extent;
   const Array<bool> periodic = mesh_.shape().periodic();
   std::unordered_map<std::uint64_t, int> number;
   number.reserve(grid.nodes.size());

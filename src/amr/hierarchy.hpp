@@ -67,6 +67,7 @@ struct Grid {
 
   Layout layout;
   double dx = 1;
+  IntVec extent{};  ///< of the box, nodes
   std::vector<Node> nodes;
   std::vector<int> local;  ///< this rank's nodes
 
@@ -110,7 +111,8 @@ struct Range {
   IntVec lo{}, size{};
 };
 
-/// Grid 0 is the finest level of the tree; grid levels()-1 the roots; then roots of half the cells, down to 2.
+/// Grid 0 is the finest level of the tree; grid levels()-1 the roots; then roots of half the cells, down to 2; then groups
+/// of roots while they are many and their number is even along every axis.
 class Hierarchy {
  public:
   explicit Hierarchy(const Mesh& mesh);
