@@ -155,6 +155,12 @@ Settings::Settings() {
         {"output.diagnostics_every_tau0", output.diagnostics_every_tau0}};
     for (const auto& [key, tau0] : intervals)
       if (tau0 && *tau0 < SHORTEST) checks.fail(key, "at least .001 tau0: steps end on output times");
+    if (sized && mesh.root_blocks.has_value() == mesh.levels.has_value() && checks.has_table("flow")) {
+      try {
+        flow.check_sides(checks, choose_shape(size, mesh));
+      } catch (const std::invalid_argument&) {  // reported above
+      }
+    }
     if (!sized || !seeded) return;
     const std::vector<physics::Seed> seeds = physics::make_seeds(seed, s);
     for (std::size_t i = 0; i < seeds.size(); ++i)

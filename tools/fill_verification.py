@@ -53,6 +53,32 @@ def disc(r):
             num(r["error_percent"], 2) + " %" if r["error_percent"] else "", r["iterations"]]
 
 
+def disc_settling_closed(r):
+    return [r["L_over_R"], r["R_W0"], r["dx_W0"], r["levels"], num(r["U_nu_over_F"], 5), num(r["error_percent"], 2) + " %", num(r["offset_W0"], 3)]
+
+
+def against(*keys, digits=3):
+    return lambda r: [*(num(r[k], 1) if "." in r[k] and k == "R_W0" else r[k] for k in keys[:-1]), num(r[keys[-1]], digits), r["reference"],
+                      num(r["error_percent"], 2) + " %"]
+
+
+def ellipse_in_shear(r):
+    return [num(r["side_over_long_axis"], 2), r["tolerance"], num(r["T_gamma"], 3), r["reference"], num(r["error_percent"], 2) + " %",
+            num(r["slowest_spin"], 4), num(r["fastest_spin"], 4)]
+
+
+def falling_disc(r):
+    return [r["R_W0"], r["weight"], num(r["Re"], 2), num(r["still_rising_percent"], 2) + " %", num(r["area_change_percent"], 3) + " %"]
+
+
+def cavity(r):
+    return [r["Re"], r["cells"], *(num(r[f"{a}_{b}_difference"], 4) for a in "uv" for b in ("largest", "rms"))]
+
+
+def taylor_green(r):
+    return [r["cells"], r["dt_tau0"], num(r["rms_error_percent"], 3) + " %", num(r["order"], 2) if r["order"] else ""]
+
+
 def width_rows():
     table = rows("width")
     base = next(float(r["tip_um"]) for r in table if r["W0_over_d0"] == "10" and r["dx_W0"] == "0.8")
@@ -70,6 +96,17 @@ TABLES = {
     "growth": lambda: map(growth, rows("growth_2d")), "growth_dt": lambda: map(growth_dt, rows("growth_2d_time_step")),
     "growth_3d": lambda: map(growth_3d, rows("growth_3d")), "rotation": lambda: map(rotation, rows("rotation")),
     "drift": lambda: map(drift, rows("drift")), "carried": lambda: map(carried, rows("carried")), "disc": lambda: map(disc, rows("disc")),
+    "disc_settling_closed": lambda: map(disc_settling_closed, rows("disc_settling_closed")),
+    "disc_linear": lambda: map(against("dx_W0", "velocity_over_b_nu"), rows("disc_linear")),
+    "disc_in_shear": lambda: map(lambda r: [r["box"], r["stress"], r["R_W0"], r["dx_W0"], f"{float(r['spin']):.4g}", r["reference"],
+                                            num(r["error_percent"], 2) + " %"], rows("disc_in_shear")),
+    "disc_between_walls": lambda: map(against("d_over_W", "R_W0", "drag"), rows("disc_between_walls")),
+    "disc_in_couette": lambda: map(against("d_over_W", "R_W0", "spin", digits=4), rows("disc_in_couette")),
+    "cylinder_array": lambda: map(against("fraction", "R_W0", "drag", digits=2), rows("cylinder_array")),
+    "sphere_array": lambda: map(against("fraction", "R_W0", "dx_W0", "drag"), rows("sphere_array")),
+    "ellipse_in_shear": lambda: map(ellipse_in_shear, rows("ellipse_in_shear")),
+    "falling_disc": lambda: map(falling_disc, rows("falling_disc")), "cavity": lambda: map(cavity, rows("cavity")),
+    "taylor_green": lambda: map(taylor_green, rows("taylor_green")),
     "width": width_rows, "karma": karma_rows,
 }
 

@@ -327,6 +327,272 @@ def disc():
     write("disc", rows)
 
 
+class FlowRun:
+    """One run of an input whose W0 is 1 um and tau0 1 s, so that the files are in W0 and tau0."""
+
+    def __init__(self, name, *overrides, ranks=None):
+        folder = tempfile.mkdtemp(prefix="dendrift_verify_") if not ARGS.keep else os.path.join("out", "verify")
+        self.dir = os.path.join(folder, "run")
+        command = ["mpirun", "--oversubscribe", "-n", str(ranks or ARGS.ranks), os.path.join(ARGS.build, "dendrift"),
+                   os.path.join(ROOT, "inputs", "verification", name), f"output.dir={self.dir}", *overrides]
+        done = subprocess.run(command, capture_output=True, text=True)
+        if done.returncode != 0:
+            sys.exit(f"{' '.join(command)}\nended with {done.returncode}:\n{done.stdout[-2000:]}{done.stderr[-3000:]}")
+        read = lambda file: [{k: float(v) for k, v in row.items()} for row in csv.DictReader(open(os.path.join(self.dir, file)))]
+        self.diagnostics, self.grains = read("diagnostics.csv"), read("grains.csv")
+        self.wall = json.load(open(os.path.join(self.dir, "manifest.json")))["wall_s"]
+        self.iterations = int(max(d["flow_iterations"] for d in self.diagnostics))
+
+    def plotfile(self):
+        """The last one."""
+        sys.path.insert(0, os.path.join(ROOT, "tools"))
+        import plotfile
+        return plotfile.Plotfile(os.path.join(self.dir, sorted(f for f in os.listdir(self.dir) if f.startswith("plt_"))[-1]))
+
+    def drag(self, nu=1e9, weight=1e5):
+        """F/(mu U) of the first crystal: its weight over nu and its velocity along the last axis."""
+        g = self.grains[-1]
+        size, speed = (g["area_um2"], g["vy_um_s"]) if "area_um2" in g else (g["volume_um3"], g["vz_um_s"])
+        return weight * size / (nu * -speed)
+
+    def cost(self):
+        return {"iterations": self.iterations, "wall_s": self.wall}
+
+
+def flow_box(size, cells, levels=1, seed=None, n=16):
+    """A box with so many cells along its sides on the finest level; seed: place and radius."""
+    unit = n * 2 ** (levels - 1)
+    assert all(c % unit == 0 for c in cells), cells
+    words = [f"mesh.size_W0={[float(x) for x in size]}", f"mesh.root_blocks={[c // unit for c in cells]}", f"mesh.levels={levels}",
+             f"mesh.block_cells={n}"]
+    if seed:
+        words += [f"seed[0].position_W0={[float(x) for x in seed[0]]}", f"seed[0].radius_W0={seed[1]!r}"]
+    return words
+
+
+@case
+def disc_settling_closed():
+    """A disc in a closed square box of side L against the sharp disc; offset: the sharp disc as fast is so much larger."""
+    table = {8: 0.044211, 16: 0.093203}
+    # 4 pi nu U/F = ln x - C + a/x^2, x = L/R, through both values of the table
+    a = (4 * math.pi * (table[16] - table[8]) - math.log(2)) / (1 / 256 - 1 / 64)
+    c = math.log(8) + a / 64 - 4 * math.pi * table[8]
+    rows = []
+    for ratio, radius, cells, levels in ((8, 10, 80, 1), (8, 10, 160, 1), (8, 20, 160, 1), (8, 40, 320, 1), (16, 10, 160, 1),
+                                         (16, 20, 320, 1), (16, 20, 320, 3), (16, 40, 640, 3)):
+        side = ratio * radius
+        r = FlowRun("disc_settling_closed.toml", *flow_box([side] * 2, [cells] * 2, levels, ([side / 2] * 2, radius), n=16 if levels == 1 or cells > 320 else 8))
+        u = 1 / r.drag()
+        lo, hi = 0.5 * ratio, 2 * ratio
+        for _ in range(60):
+            x = 0.5 * (lo + hi)
+            lo, hi = (x, hi) if math.log(x) - c + a / x**2 < 4 * math.pi * u else (lo, x)
+        rows.append({"L_over_R": ratio, "R_W0": radius, "dx_W0": side / cells, "levels": levels, "U_nu_over_F": u,
+                     "reference": table[ratio], "error_percent": percent(u, table[ratio]), "offset_W0": side / x - radius,
+                     "nonrigidity": r.grains[-1]["nonrigidity"]} | r.cost())
+    write("disc_settling_closed", rows)
+
+
+@case
+def disc_linear():
+    """The disc in a closed box with the printed, linear law of the viscosity."""
+    rows = []
+    for cells in (80, 160, 320):
+        r = FlowRun("disc_linear.toml", *flow_box([80, 80], [cells] * 2))
+        v = -r.grains[-1]["vy_um_s"] * 1e9 / 1e5
+        rows.append({"dx_W0": 80 / cells, "velocity_over_b_nu": v, "reference": 3.296, "error_percent": percent(v, 3.296)} | r.cost())
+    write("disc_linear", rows)
+
+
+@case
+def disc_in_shear():
+    """Spin of a free disc, over half the vorticity, in boxes whose walls move with the shear flow; both stresses."""
+    rows = []
+    for shape, size, reference in (("square", (8, 8), 1.0), ("8R x 4R", (8, 4), 0.8311)):
+        for radius, dx in ((20, 1), (40, 1), (20, 0.5)):
+            side = [s * radius for s in size]
+            r = FlowRun("disc_in_shear.toml", *flow_box(side, [round(s / dx) for s in side], 1, ([s / 2 for s in side], radius)))
+            spin = -r.grains[-1]["omega_rad_s"] / 0.5e-3
+            rows.append({"box": shape, "stress": "symmetric", "R_W0": radius, "dx_W0": dx, "spin": spin, "reference": reference,
+                         "error_percent": percent(spin, reference)} | r.cost())
+    r = FlowRun("disc_in_shear.toml", 'flow.stress="laplacian"')
+    spin = -r.grains[-1]["omega_rad_s"] / 0.5e-3
+    rows.append({"box": "square", "stress": "laplacian", "R_W0": 20, "dx_W0": 1, "spin": spin, "reference": 4e-6,
+                 "error_percent": percent(spin, 4e-6)} | r.cost())
+    write("disc_in_shear", rows)
+
+
+CHANNEL = {0.1: (8.951, 0.4972), 0.2: (16.533, 0.4887), 0.3: (29.16, 0.4737), 0.5: (99.4, 0.4196)}
+
+
+def channel(width_over_d, radius):
+    """Width of the channel, cells across it and levels."""
+    width = 2 * radius / width_over_d
+    cells = round(width / 32) * 32
+    return width, cells
+
+
+@case
+def disc_between_walls():
+    """Drag of a disc that settles in the middle of a channel whose closed ends are two widths away."""
+    rows = []
+    for ratio, (reference, _) in CHANNEL.items():
+        for radius in (16, 32) if ratio > 0.15 else (12.8,):
+            width, cells = channel(ratio, radius)
+            levels = 2
+            r = FlowRun("disc_between_walls.toml", *flow_box([width, 4 * width], [cells, 4 * cells], levels, ([width / 2, 2 * width], radius)))
+            rows.append({"d_over_W": ratio, "R_W0": radius, "dx_W0": width / cells, "drag": r.drag(), "reference": reference,
+                         "error_percent": percent(r.drag(), reference)} | r.cost())
+    write("disc_between_walls", rows)
+
+
+@case
+def disc_in_couette():
+    """Spin of a free disc in the middle of a channel with walls that move against each other."""
+    rows = []
+    for ratio, (_, reference) in CHANNEL.items():
+        for radius in (16, 32) if ratio > 0.15 else (12.8,):
+            width, cells = channel(ratio, radius)
+            r = FlowRun("disc_in_couette.toml", *flow_box([4 * width, width], [4 * cells, cells], 2, ([2 * width, width / 2], radius)))
+            spin = -r.grains[-1]["omega_rad_s"] / 1e-3
+            rows.append({"d_over_W": ratio, "R_W0": radius, "dx_W0": width / cells, "spin": spin, "reference": reference,
+                         "error_percent": percent(spin, reference)} | r.cost())
+    write("disc_in_couette", rows)
+
+
+@case
+def cylinder_array():
+    """Drag of a square array of cylinders, Sangani & Acrivos (1982)."""
+    rows = []
+    for fraction, reference in ((0.05, 15.56), (0.1, 24.83), (0.2, 51.53), (0.3, 102.9), (0.4, 217.9), (0.5, 532.6)):
+        for cells in (128, 256):
+            radius = cells * math.sqrt(fraction / math.pi)
+            r = FlowRun("cylinder_array.toml", *flow_box([cells] * 2, [cells] * 2, 1, ([cells / 2] * 2, radius)))
+            rows.append({"fraction": fraction, "R_W0": radius, "drag": r.drag(), "reference": reference,
+                         "error_percent": percent(r.drag(), reference)} | r.cost())
+    write("cylinder_array", rows)
+
+
+@case
+def sphere_array():
+    """Drag of a simple cubic array of spheres over 6 pi mu a U, Zick & Homsy (1982)."""
+    rows = []
+    for fraction, reference in ((0.027, 2.008), (0.064, 2.810), (0.125, 4.292), (0.216, 7.442)):
+        for side, dx in ((32, 1), (32, 0.5), (64, 1), (96, 1)):
+            radius = side * (0.75 * fraction / math.pi) ** (1 / 3)
+            r = FlowRun("sphere_array.toml", *flow_box([side] * 3, [round(side / dx)] * 3, 1, ([side / 2] * 3, radius)))
+            drag = r.drag() / (6 * math.pi * radius)
+            rows.append({"fraction": fraction, "R_W0": radius, "dx_W0": dx, "drag": drag, "reference": reference,
+                         "error_percent": percent(drag, reference)} | r.cost())
+    write("sphere_array", rows)
+
+
+@case
+def ellipse_in_shear():
+    """Half a turn of an ellipse of aspect ratio 2 in shear flow, against Jeffery's for an unbounded melt."""
+    rows = []
+    radius = 16.970563
+    for side, levels, tolerance in ((256, 4, 1e-9), (512, 5, 1e-9), (512, 5, 1e-8), (1024, 6, 1e-9)):
+        r = FlowRun("ellipse_in_shear.toml", *flow_box([side] * 2, [side] * 2, levels, ([side / 2] * 2, radius)), f"flow.tolerance={tolerance}")
+        half = None
+        for a, b in zip(r.grains, r.grains[1:]):
+            if a["angle_rad"] > -math.pi >= b["angle_rad"]:
+                half = a["time_s"] + (b["time_s"] - a["time_s"]) * (a["angle_rad"] + math.pi) / (a["angle_rad"] - b["angle_rad"])
+        period = 2 * half * 0.05 if half else float("nan")
+        spins = [-g["omega_rad_s"] / 0.05 for g in r.grains[2:]]
+        rows.append({"side_over_long_axis": side / (2 * radius * math.sqrt(2)), "R_W0": radius, "tolerance": tolerance, "T_gamma": period,
+                     "reference": 15.708, "error_percent": percent(period, 15.708), "slowest_spin": min(spins), "reference_slowest": 0.2,
+                     "fastest_spin": max(spins), "reference_fastest": 0.8} | r.cost())
+    write("ellipse_in_shear", rows)
+
+
+@case
+def falling_disc():
+    """Terminal Reynolds number rho_s V d/mu of the disc of Glowinski, Wan & Turek: 17.15 to 17.45."""
+    rows = []
+    for radius, weight in ((10, "of phi"), (10, "sharp"), (20, "of phi"), (20, "sharp")):
+        scale = radius / 10
+        nu = scale  # so that the velocity in W0/tau0 is the same
+        g = 0.19160156 * nu**2 / scale**3
+        if weight == "sharp":  # the tanh profile adds pi^3/6 W0^2 to the disc
+            g *= radius**2 / (radius**2 + math.pi**2 / 6)
+        r = FlowRun("falling_disc.toml", *flow_box([160 * scale, 480 * scale], [round(160 * scale), round(480 * scale)], 2 if scale == 1 else 3,
+                                                   ([80 * scale, 320 * scale], radius)),
+                    f"flow.gravity_um_s2={g!r}", f"alloy.viscosity_um2_s={nu}", f"run.end_time_tau0={400 * scale}",
+                    f"output.diagnostics_every_tau0={5 * scale}")
+        v = max(-x["vy_um_s"] for x in r.grains)
+        re = 1.25 * v * 2 * radius / nu
+        rows.append({"R_W0": radius, "weight": weight, "Re": re, "reference_low": 17.15, "reference_high": 17.45,
+                     "still_rising_percent": percent(v, -r.grains[-11]["vy_um_s"]), "sideways_over_V": max(abs(x["vx_um_s"]) for x in r.grains) / v,
+                     "area_change_percent": percent(r.grains[-1]["area_um2"], r.grains[1]["area_um2"])} | r.cost())
+    write("falling_disc", rows)
+
+
+GHIA = {  # place, velocity along the lid (x = 1/2) at Re 100 and 1000; place, velocity across it (y = 1/2)
+    "u": ((0.0547, -0.03717, -0.18109), (0.0625, -0.04192, -0.20196), (0.0703, -0.04775, -0.22220), (0.1016, -0.06434, -0.29730),
+          (0.1719, -0.10150, -0.38289), (0.2813, -0.15662, -0.27805), (0.4531, -0.21090, -0.10648), (0.5, -0.20581, -0.06080),
+          (0.6172, -0.13641, 0.05702), (0.7344, 0.00332, 0.18719), (0.8516, 0.23151, 0.33304), (0.9531, 0.68717, 0.46604),
+          (0.9609, 0.73722, 0.51117), (0.9688, 0.78871, 0.57492), (0.9766, 0.84123, 0.65928)),
+    "v": ((0.0625, 0.09233, 0.27485), (0.0703, 0.10091, 0.29012), (0.0781, 0.10890, 0.30353), (0.0938, 0.12317, 0.32627),
+          (0.1563, 0.16077, 0.37095), (0.2266, 0.17507, 0.33075), (0.2344, 0.17527, 0.32235), (0.5, 0.05454, 0.02526),
+          (0.8047, -0.24533, -0.31966), (0.8594, -0.22445, -0.42665), (0.9063, -0.16914, -0.51550), (0.9453, -0.10313, -0.39188),
+          (0.9531, -0.08864, -0.33714), (0.9609, -0.07391, -0.27669), (0.9688, -0.05906, -0.21388)),
+}
+
+
+@case
+def cavity():
+    """Lid-driven cavity at Re 100 and 1000: velocities on the centre lines against Ghia, Ghia & Shin (1982)."""
+    import numpy as np
+    rows, lines = [], []
+    for re, cells, times in ((100, 32, 20), (100, 64, 20), (1000, 64, 60), (1000, 128, 60)):
+        r = FlowRun("cavity.toml", *flow_box([cells] * 2, [cells] * 2), f"alloy.viscosity_um2_s={cells / re}", f"run.end_time_tau0={times * cells}",
+                    f"output.diagnostics_every_tau0={times * cells / 20}")
+        p = r.plotfile()
+        x, y = p.uniform("velocity_x")[0], p.uniform("velocity_y")[0]
+        middle = {"u": (x[:, cells // 2 - 1] + x[:, cells // 2]) / 2, "v": (y[cells // 2 - 1] + y[cells // 2]) / 2}
+        row = {"Re": re, "cells": cells}
+        for name, line in middle.items():
+            off = []
+            for place, at_100, at_1000 in GHIA[name]:
+                s = place * cells - 0.5
+                i = min(max(int(s) - 1, 0), cells - 4)  # cubic through four cells
+                value = sum(line[i + a] * math.prod((s - i - b) / (a - b) for b in range(4) if b != a) for a in range(4))
+                reference = at_100 if re == 100 else at_1000
+                off.append(float(value) - reference)
+                lines.append({"Re": re, "cells": cells, "line": name, "place": place, "velocity": float(value), "reference": reference})
+            row |= {f"{name}_largest_difference": max(off, key=abs), f"{name}_rms_difference": float(np.sqrt(np.mean(np.square(off))))}
+        rows.append(row | r.cost())
+    write("cavity_lines", lines)
+    write("cavity", rows)
+
+
+@case
+def taylor_green():
+    """Vortices that decay while all drifts: error of the velocity at dx and dx/2, time step with dx^2."""
+    import numpy as np
+    rows = []
+    side, u, drift, nu = 64.0, 0.1, (0.2, 0.1), 0.5
+    k, end = 2 * math.pi / side, 40.0
+    for cells, dt in ((32, 0.8), (64, 0.2), (128, 0.05)):
+        r = FlowRun("taylor_green.toml", *flow_box([side] * 2, [cells] * 2), f"flow.initial_velocity_W0_tau0={list(drift)}",
+                    f"run.end_time_tau0={end}", f"phase_field.max_dt_tau0={dt}", f"flow.max_interval_tau0={dt}",
+                    "flow.tolerance=1e-9")  # thousands of solutions follow one another
+        p = r.plotfile()
+        t, h = end - dt, side / cells  # the flow is that of the beginning of the last step
+        x = (np.arange(cells) + 0.5) * h
+        fx, fy = np.meshgrid(k * (x - drift[0] * t), k * (x - drift[1] * t))
+        # of the mean over a face, and of two faces: what the start and the file hold
+        amplitude = u * math.exp(-2 * nu * k * k * t) * math.sin(k * h / 2) / (k * h / 2) * math.cos(k * h / 2)
+        off = np.hypot(p.uniform("velocity_x")[0] - drift[0] - amplitude * np.sin(fx) * np.cos(fy),
+                       p.uniform("velocity_y")[0] - drift[1] + amplitude * np.cos(fx) * np.sin(fy))
+        rows.append({"cells": cells, "dt_tau0": dt, "rms_error_percent": 100 * float(np.sqrt(np.mean(off**2))) / (u * math.exp(-2 * nu * k * k * t) / math.sqrt(2)),
+                     "order": ""} | r.cost())
+        if len(rows) > 1:
+            rows[-1]["order"] = math.log2(rows[-2]["rms_error_percent"] / rows[-1]["rms_error_percent"])
+    write("taylor_green", rows)
+
+
 @case
 def width():
     """W0/d0 = 5 ... 30 at the same physical seed and time (.05 s)."""

@@ -448,8 +448,18 @@ void Hierarchy::apply_sides(HierarchyField& f, int g, int i, int depth, bool hom
       if (n.neighbours[at(towards(axis, high ? 1 : -1))] != Grid::OUTSIDE) continue;
       for (int c = 0; c < f.components(); ++c) {
         const Component& component = f.component(c);
-        const MirrorRule rule = component.sides[at(face_of(axis, high))];
-        const double value = homogeneous ? 0.0 : rule.value;
+        const MirrorRule& rule = component.sides[at(face_of(axis, high))];
+        const double constant = homogeneous ? 0.0 : rule.value.constant;
+        const bool varies = !homogeneous && !rule.value.uniform();  // on levels of the tree only
+        const auto value = [&](const IntVec& q) {
+          if (!varies) return constant;
+          RealVec place{};
+          for (int a = 0; a < DIM; ++a) {
+            const double start = mesh_.shape().lo[a] + gr.dx * n.index.coord[a] * cells;
+            place[a] = start + gr.dx * (a == axis ? (high ? cells : 0) : a == component.normal ? q[a] : q[a] + 0.5);
+          }
+          return rule.value.at(place, gr.dx);
+        };
         const ArrayRef<double> x = f.ref(g, i, c);
         IntVec lo = filled(-G), size = filled(cells + 2 * G);
         size[axis] = 1;
@@ -459,7 +469,7 @@ void Hierarchy::apply_sides(HierarchyField& f, int g, int i, int depth, bool hom
           const std::ptrdiff_t back = (from - to) * x.stride[axis];
           for_each_cell(at_to, size, [&](const IntVec& q) {
             double* p = x.at(q);
-            *p = rule.odd ? 2 * value - p[back] : p[back];
+            *p = rule.odd ? 2 * value(q) - p[back] : p[back];
           });
         };
         if (component.normal == axis) {
@@ -467,7 +477,7 @@ void Hierarchy::apply_sides(HierarchyField& f, int g, int i, int depth, bool hom
           if (rule.odd) {
             IntVec at_side = lo;
             at_side[axis] = side;
-            for_each_cell(at_side, size, [&](const IntVec& q) { *x.at(q) = value; });
+            for_each_cell(at_side, size, [&](const IntVec& q) { *x.at(q) = value(q); });
           }
           for (int k = 1; k <= (high ? 1 : depth); ++k) plane(high ? side + k : side - k, high ? side - k : side + k);
         } else {

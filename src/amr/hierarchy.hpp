@@ -13,12 +13,35 @@
 
 namespace dendrift::amr {
 
+/// A value on a side of the domain: affine, plus a constant that falls off as a parabola along some axes.
+struct SideValue {
+  double constant = 0;
+  RealVec gradient{};  ///< the affine part is gradient . (x - centre)
+  RealVec centre{};
+  RealVec half{};      ///< > 0: the constant falls to 0 so far from the centre along this axis
+  bool uniform() const {
+    for (int a = 0; a < DIM; ++a)
+      if (gradient[a] != 0 || half[a] > 0) return false;
+    return true;
+  }
+  /// Mean over a place of width dx on the side, so that what flows through a side does not depend on the level.
+  double at(const RealVec& x, double dx) const {
+    double fall = constant, affine = 0;
+    for (int a = 0; a < DIM; ++a) {
+      const double r = x[a] - centre[a];
+      affine += gradient[a] * r;
+      if (half[a] > 0) fall *= 1 - (r * r + dx * dx / 12) / (half[a] * half[a]);
+    }
+    return fall + affine;
+  }
+};
+
 /// What lies beyond a side of the domain. For cells, and for velocities along the side: the mirror image with
 /// the same (even) or the opposite sign (odd, about `value`). For the velocity through the side: fixed at
 /// `value` on it (odd), or free (even).
 struct MirrorRule {
   bool odd = false;
-  double value = 0;
+  SideValue value{};
 };
 
 /// Centring and side rules of one component of a field on the hierarchy.
@@ -68,7 +91,9 @@ class HierarchyField {
   ArrayRef<const double> ref(int g, int i, int c) const;
   void clear(int g);
   /// Sets the values of odd side rules.
-  void set_side(int c, int face, double value) { components_[static_cast<std::size_t>(c)].sides[static_cast<std::size_t>(face)].value = value; }
+  void set_side(int c, int face, const SideValue& value) {
+    components_[static_cast<std::size_t>(c)].sides[static_cast<std::size_t>(face)].value = value;
+  }
 
  private:
   std::ptrdiff_t offset(int g, int i, int c) const {

@@ -4,6 +4,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <numbers>
 
 #include "amr/comm.hpp"
 #include "amr/loops.hpp"
@@ -15,6 +16,16 @@ namespace dendrift::physics {
 namespace {
 
 std::size_t at(int i) { return static_cast<std::size_t>(i); }
+
+constexpr std::array SIDES{"xlo", "xhi", "ylo", "yhi", "zlo", "zhi"};
+
+RealVec centre_of(const amr::MeshShape& shape) {
+  RealVec c{};
+  for (int a = 0; a < DIM; ++a) c[a] = 0.5 * (shape.lo[a] + shape.hi()[a]);
+  return c;
+}
+
+double of_gradient(const Gradient& g, int component, int along) { return g[at(component * DIM + along)]; }
 
 amr::FieldSpec velocity_field() {
   amr::FieldSpec f;
@@ -31,6 +42,9 @@ void FlowOptions::declare(io::Schema& schema) {
   io::Table& t = schema.table("flow", "motion of melt and crystals; without this table nothing moves");
   t.reals("velocity_um_s", velocity_um_s).unit("um/s").doc("uniform velocity, prescribed: nothing is solved; or velocity_W0_tau0");
   t.reals("velocity_W0_tau0", velocity_w0_tau0).unit("W0/tau0").doc("uniform velocity, prescribed: nothing is solved");
+  t.reals("velocity_gradient_per_tau0", velocity_gradient_per_tau0)
+      .unit("1/tau0")
+      .doc("prescribed, on top of it: dvx/dx, dvx/dy, ..., dvy/dx, ... about the middle of the box; nothing is solved");
   t.real("viscosity_ratio", viscosity_ratio).range(1, 1e9).doc("viscosity of the solid over that of the melt");
   t.choice("viscosity", viscosity, {{"h3", ViscosityLaw::h3}, {"h2", ViscosityLaw::h2}, {"h1", ViscosityLaw::h1},
                                     {"linear", ViscosityLaw::linear}})
@@ -50,20 +64,97 @@ void FlowOptions::declare(io::Schema& schema) {
   t.real("courant", courant).range(0.01, 10).doc("cells that the melt moves between two solutions at most");
   t.real("max_interval_tau0", max_interval_tau0).unit("tau0").above(0).doc("time between two solutions at most");
   t.real("max_change", max_change).range(1e-6, 10).doc("relative change of the velocity between two solutions aimed at");
-  const char* sides[] = {"xlo", "xhi", "ylo", "yhi", "zlo", "zhi"};
   for (std::size_t f = 0; f < 6; ++f)
-    t.reals(std::string(sides[f]) + "_velocity_W0_tau0", wall_velocity_w0_tau0[f])
+    t.reals(std::string(SIDES[f]) + "_velocity_W0_tau0", wall_velocity_w0_tau0[f])
         .unit("W0/tau0")
-        .doc(f < 4 ? "velocity of this wall along itself" : "velocity of this wall along itself; 3D only");
+        .doc(std::string("velocity on this wall; its component through the wall is in- or outflow") + (f < 4 ? "" : "; 3D only"));
+  for (std::size_t f = 0; f < 6; ++f)
+    t.choice(std::string(SIDES[f]) + "_profile", wall_profile[f], {{"uniform", Profile::uniform}, {"parabolic", Profile::parabolic}})
+        .doc(std::string("of that velocity; parabolic: as given in the middle, 0 at the edges") + (f < 4 ? "" : "; 3D only"));
+  t.reals("wall_gradient_per_tau0", wall_gradient_per_tau0)
+      .unit("1/tau0")
+      .doc("on all walls, on top of it: dvx/dx, dvx/dy, ..., dvy/dx, ... about the middle of the box");
+  t.reals("initial_velocity_W0_tau0", initial_velocity_w0_tau0).unit("W0/tau0").doc("at the start, everywhere");
+  t.real("initial_vortex_W0_tau0", initial_vortex_w0_tau0)
+      .unit("W0/tau0")
+      .doc("largest velocity of four vortices that fill the box at the start, on top of it (Taylor-Green)");
   schema.check({"flow"}, [this](io::Checks& checks) {
     if (!checks.has_table("flow")) return;
     if (velocity_um_s && velocity_w0_tau0)
       checks.fail("flow", "at most one of velocity_um_s and velocity_W0_tau0", "both");
-    for (int f = 0; f < FACES; ++f)
-      if (const auto& v = wall_velocity_w0_tau0[at(f)]; v && (*v)[face_axis(f)] != 0)
-        checks.fail("flow." + std::string("xyz"[face_axis(f)] + std::string(face_is_high(f) ? "hi" : "lo")) + "_velocity_W0_tau0",
-                    "no component through the wall");
+    if (!velocity_gradient_per_tau0) return;
+    double trace = 0, largest = 0;
+    for (int a = 0; a < DIM; ++a) {
+      trace += of_gradient(*velocity_gradient_per_tau0, a, a);
+      largest = std::max(largest, std::abs(of_gradient(*velocity_gradient_per_tau0, a, a)));
+    }
+    if (std::abs(trace) > 1e-12 * largest)
+      checks.fail("flow.velocity_gradient_per_tau0", "no divergence: dvx/dx + dvy/dy + ... = 0", fmt::format("{:.6g}", trace));
   });
+}
+
+amr::SideValue FlowOptions::wall_value(const amr::MeshShape& shape, int axis, int face) const {
+  amr::SideValue v;
+  v.centre = centre_of(shape);
+  if (const auto& given = wall_velocity_w0_tau0[at(face)]) v.constant = (*given)[axis];
+  for (int a = 0; a < DIM; ++a) {
+    if (wall_gradient_per_tau0) v.gradient[a] = of_gradient(*wall_gradient_per_tau0, axis, a);
+    if (wall_profile[at(face)] == Profile::parabolic && a != face_axis(face)) v.half[a] = 0.5 * (shape.hi()[a] - shape.lo[a]);
+  }
+  return v;
+}
+
+bool FlowOptions::through_walls(const amr::MeshShape& shape) const {
+  for (int f = 0; f < FACES; ++f) {
+    const int axis = face_axis(f);
+    const amr::SideValue v = wall_value(shape, axis, f);
+    if (shape.sides[at(f)] == amr::Side::wall && (v.constant != 0 || v.gradient != RealVec{})) return true;
+  }
+  return false;
+}
+
+void FlowOptions::check_sides(io::Checks& checks, const amr::MeshShape& shape) const {
+  double net = 0, gross = 0;  // what flows out, all and in absolute value
+  bool open = false;
+  for (int f = 0; f < FACES; ++f) {
+    open = open || shape.sides[at(f)] == amr::Side::open;
+    const int axis = face_axis(f);
+    const std::string key = std::string("flow.") + SIDES[at(f)] + "_velocity_W0_tau0";
+    if (shape.sides[at(f)] != amr::Side::wall) {
+      if (wall_velocity_w0_tau0[at(f)]) checks.fail(key, fmt::format("mesh.{} = \"wall\": only walls have a velocity", SIDES[at(f)]));
+      continue;
+    }
+    RealVec x = centre_of(shape);
+    x[axis] = face_is_high(f) ? shape.hi()[axis] : shape.lo[axis];
+    amr::SideValue v = wall_value(shape, axis, f);
+    double area = 1, part = 1;
+    for (int a = 0; a < DIM; ++a) {
+      if (a == axis) continue;
+      area *= shape.hi()[a] - shape.lo[a];
+      if (v.half[a] > 0) part *= 2.0 / 3;
+      v.half[a] = 0;
+    }
+    v.constant *= part;
+    net += (face_is_high(f) ? area : -area) * v.at(x, 0);
+    gross += area * std::abs(v.at(x, 0));
+  }
+  if (!open && std::abs(net) > 1e-12 * gross)
+    checks.fail("flow", "no net flow through the sides, or a side that is open",
+                fmt::format("{:.6g} W0^{}/tau0 flowing {}", std::abs(net), DIM, net > 0 ? "out" : "in"));
+  for (int a = 0; a < DIM; ++a) {
+    if (!shape.periodic()[a]) continue;
+    for (int c = 0; c < DIM; ++c) {
+      const std::string expected = fmt::format("no change along {}, which is periodic", "xyz"[a]);
+      if (wall_gradient_per_tau0 && of_gradient(*wall_gradient_per_tau0, c, a) != 0)
+        checks.fail("flow.wall_gradient_per_tau0", expected);
+      if (velocity_gradient_per_tau0 && of_gradient(*velocity_gradient_per_tau0, c, a) != 0)
+        checks.fail("flow.velocity_gradient_per_tau0", expected);
+    }
+  }
+  if (initial_vortex_w0_tau0 != 0)
+    for (int f = 0; f < 4; ++f)
+      if (const amr::Side s = shape.sides[at(f)]; s != amr::Side::periodic && s != amr::Side::symmetry)
+        checks.fail("flow.initial_vortex_W0_tau0", "sides in x and y that are periodic or symmetry");
 }
 
 double relative_viscosity(ViscosityLaw law, double ratio, double phi) {
@@ -79,10 +170,31 @@ double relative_viscosity(ViscosityLaw law, double ratio, double phi) {
   return (a + b) / (a / ratio + b);
 }
 
-PrescribedFlow::PrescribedFlow(const FlowOptions& o, const Scales& scales, std::vector<Seed>& crystals) {
-  for (int a = 0; a < DIM; ++a)
-    velocity_[a] = o.velocity_w0_tau0 ? (*o.velocity_w0_tau0)[a] : (*o.velocity_um_s)[a] * scales.tau0_s / scales.w0_um;
-  for (Seed& g : crystals) g.velocity = velocity_;
+PrescribedFlow::PrescribedFlow(const FlowOptions& o, const Scales& scales, std::vector<Seed>& crystals) : crystals_(crystals) {
+  for (int a = 0; a < DIM; ++a) {
+    if (o.velocity_w0_tau0) velocity_[a] = (*o.velocity_w0_tau0)[a];
+    if (o.velocity_um_s) velocity_[a] = (*o.velocity_um_s)[a] * scales.tau0_s / scales.w0_um;
+  }
+  if (o.velocity_gradient_per_tau0) gradient_ = *o.velocity_gradient_per_tau0;
+}
+
+void PrescribedFlow::attach(amr::Mesh& mesh, amr::GhostExchange&) {
+  mesh_ = &mesh;
+  for (Seed& g : crystals_) {
+    g.velocity = velocity_at(g.position);
+    for (int axis = DIM == 2 ? 2 : 0; axis < 3; ++axis) {  // half the curl
+      const int a = (axis + 1) % 3, e = (axis + 2) % 3;
+      g.spin[at(axis)] = 0.5 * (of_gradient(gradient_, e, a) - of_gradient(gradient_, a, e));
+    }
+  }
+}
+
+RealVec PrescribedFlow::velocity_at(const RealVec& x) const {
+  const RealVec centre = centre_of(mesh_->shape());
+  RealVec v = velocity_;
+  for (int c = 0; c < DIM; ++c)
+    for (int a = 0; a < DIM; ++a) v[c] += of_gradient(gradient_, c, a) * (x[a] - centre[a]);
+  return v;
 }
 
 void PrescribedFlow::declare(amr::FieldTable& fields) { v_ = fields.add_face(velocity_field()); }
@@ -91,16 +203,34 @@ void PrescribedFlow::after_regrid() {
   const amr::Layout& layout = mesh_->layout();
   amr::parallel_for(mesh_->size(), [&](int b) {
     for (int axis = 0; axis < DIM; ++axis) {
-      double* v = mesh_->faces(v_, axis, b) - layout.interior();
-      std::fill_n(v, layout.size(), velocity_[axis]);
+      double* v = mesh_->faces(v_, axis, b);
+      const amr::Block& block = mesh_->block(b);
+      amr::for_each_cell(filled(-amr::Layout::GHOSTS), filled(layout.pitch()), [&](const IntVec& q) {
+        RealVec x{};
+        for (int a = 0; a < DIM; ++a) x[a] = block.lo[a] + (q[a] + (a == axis ? 0.0 : 0.5)) * block.dx;
+        v[layout.offset(q)] = velocity_at(x)[axis];
+      });
     }
   });
 }
 
+void PrescribedFlow::advance(double, double dt, std::int64_t) {
+  for (Seed& g : crystals_) {  // the velocity halfway through the step
+    const RealVec now = velocity_at(g.position);
+    RealVec x = g.position;
+    for (int a = 0; a < DIM; ++a) x[a] += 0.5 * dt * now[a];
+    g.velocity = velocity_at(x);
+  }
+}
+
 void PrescribedFlow::report(Report& r) const {
-  double square = 0;
-  for (const double v : velocity_) square += v * v;
-  r.max_speed = std::sqrt(square);
+  for (int corner = 0; corner < CHILDREN; ++corner) {
+    RealVec x{};
+    for (int a = 0; a < DIM; ++a) x[a] = (corner >> a & 1) != 0 ? mesh_->shape().hi()[a] : mesh_->shape().lo[a];
+    double square = 0;
+    for (const double v : velocity_at(x)) square += v * v;
+    r.max_speed = std::max(r.max_speed, std::sqrt(square));
+  }
 }
 
 Flow::Flow(const FlowOptions& o, const Scales& s, std::vector<Seed>& crystals) : options_(o), scales_(s), crystals_(crystals) {
@@ -142,6 +272,32 @@ void Flow::attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) {
   c_ = {mesh.fields().find("c").value()};
 }
 
+// A uniform velocity and v = curl of (U/k_y) sin(k_x x) sin(k_y y), as differences of what stands at edges: free of
+// divergence on every mesh.
+void Flow::initialize() {
+  const amr::Layout& layout = mesh_->layout();
+  const RealVec lo = mesh_->shape().lo, hi = mesh_->shape().hi();
+  const double kx = 2 * std::numbers::pi / (hi[0] - lo[0]), ky = 2 * std::numbers::pi / (hi[1] - lo[1]);
+  amr::parallel_for(mesh_->size(), [&](int b) {
+    const amr::Block& block = mesh_->block(b);
+    const auto stream = [&](double x, double y) {
+      return options_.initial_vortex_w0_tau0 / ky * std::sin(kx * (x - lo[0])) * std::sin(ky * (y - lo[1]));
+    };
+    for (int a = 0; a < DIM; ++a) {
+      double* v = mesh_->faces(v_, a, b);
+      IntVec size = filled(layout.n);
+      ++size[a];
+      amr::for_each_cell({}, size, [&](const IntVec& q) {
+        const double x = block.lo[0] + q[0] * block.dx, y = block.lo[1] + q[1] * block.dx;
+        double value = options_.initial_velocity_w0_tau0[a];
+        if (options_.initial_vortex_w0_tau0 != 0 && a == 0) value += (stream(x, y + block.dx) - stream(x, y)) / block.dx;
+        if (options_.initial_vortex_w0_tau0 != 0 && a == 1) value -= (stream(x + block.dx, y) - stream(x, y)) / block.dx;
+        v[layout.offset(q)] = value;
+      });
+    }
+  });
+}
+
 void Flow::after_regrid() {
   solver_.reset();
   const std::span<const amr::BlockIndex> leaves = mesh_->tree().leaves();
@@ -174,8 +330,8 @@ void Flow::load() {
     o.max_iterations = options_.max_iterations;
     solver_ = std::make_unique<StokesSolver>(*mesh_, o);
     for (int f = 0; f < FACES; ++f)
-      if (const auto& v = options_.wall_velocity_w0_tau0[at(f)])
-        for (int a = 0; a < DIM; ++a) solver_->set_wall_velocity(a, f, (*v)[a]);
+      for (int a = 0; a < DIM && mesh_->shape().sides[at(f)] == amr::Side::wall; ++a)
+        solver_->set_wall_velocity(a, f, options_.wall_value(mesh_->shape(), a, f));
   }
   amr::HierarchyField& state = solver_->state();
   amr::parallel_for(mesh_->size(), [&](int b) {
@@ -276,8 +432,8 @@ void Flow::add_inertia(int b) {
         const double* u = state.at(g, i, e) + q;
         const double speed = e == a ? v[q] : 0.25 * ((u[0] + u[s]) + (u[-t] + u[s - t]));
         const std::ptrdiff_t d = speed > 0 ? -s : s;  // towards where the fluid comes from
-        // The last face of a block has one face beyond it: first order there.
-        const bool wide = cell[e] >= 1 && cell[e] < layout.n - 1 + (speed > 0 ? 1 : 0);
+        // The high side of a block has one face beyond it: first order there, against the axis.
+        const bool wide = speed > 0 || cell[e] < layout.n;
         double gradient = v[q] - v[q + d];
         if (wide) {
           const double ahead = v[q - d] - v[q], behind = v[q] - v[q + d], further = v[q + d] - v[q + 2 * d];
@@ -293,6 +449,54 @@ void Flow::add_inertia(int b) {
   }
 }
 
+// Axes along which nothing stops the melt as a whole: there a mean pressure gradient balances the forces.
+Array<bool> Flow::unheld() const {
+  const auto& sides = mesh_->shape().sides;
+  const bool held = std::ranges::any_of(sides, [](amr::Side s) { return s == amr::Side::wall || s == amr::Side::open; });
+  Array<bool> axes = mesh_->shape().periodic();
+  for (bool& a : axes) a = a && !held;
+  return axes;
+}
+
+// Of values on faces, over the box.
+RealVec Flow::means(const amr::HierarchyField& f) const {
+  std::vector<std::array<double, DIM>> parts(at(mesh_->size()));
+  double box = 1;
+  for (int a = 0; a < DIM; ++a) box *= mesh_->shape().hi()[a] - mesh_->shape().lo[a];
+  amr::parallel_for(mesh_->size(), [&](int b) {
+    const auto [g, i] = solver_->hierarchy().place_of_block(b);
+    const amr::Layout& layout = mesh_->layout();
+    for (int a = 0; a < DIM; ++a) {
+      const double* x = f.at(g, i, a);
+      double sum = 0;
+      amr::for_each_cell({}, filled(layout.n), [&](const IntVec& q) {
+        const std::ptrdiff_t o = layout.offset(q);
+        sum += 0.5 * (x[o] + x[o + layout.stride(a)]);
+      });
+      parts[at(b)][at(a)] = sum * std::pow(mesh_->block(b).dx, DIM) / box;
+    }
+  });
+  std::vector<amr::ExactSum> total(DIM);
+  for (const auto& part : parts)
+    for (std::size_t a = 0; a < DIM; ++a) total[a].add(part[a]);
+  const std::vector<double> all = amr::exact_sums(total, mesh_->comm());
+  RealVec mean{};
+  std::copy_n(all.begin(), DIM, mean.begin());
+  return mean;
+}
+
+void Flow::shift(amr::HierarchyField& f, const RealVec& by, const Array<bool>& axes) {
+  const amr::Layout& layout = mesh_->layout();
+  amr::parallel_for(mesh_->size(), [&](int b) {
+    const auto [g, i] = solver_->hierarchy().place_of_block(b);
+    for (int a = 0; a < DIM; ++a) {
+      if (!axes[a]) continue;
+      double* x = f.at(g, i, a) - layout.interior();
+      for (std::ptrdiff_t q = 0; q < layout.size(); ++q) x[q] += by[a];
+    }
+  });
+}
+
 void Flow::solve(double elapsed) {
   ghosts_->fill({psi_, c_});
   load();
@@ -300,11 +504,25 @@ void Flow::solve(double elapsed) {
   set_viscosity();
   const double sigma = 1 / elapsed;
   set_force(sigma);
+  const Array<bool> unheld_axes = unheld();
+  const bool any_unheld = std::ranges::find(unheld_axes, true) != unheld_axes.end();
+  RealVec drift{};
+  if (any_unheld) {
+    drift = means(solver_->state());
+    RealVec excess = means(solver_->force());
+    for (int a = 0; a < DIM; ++a) excess[a] = sigma * drift[a] - excess[a];
+    shift(solver_->force(), excess, unheld_axes);
+  }
   extrapolate(elapsed);
   result_ = solver_->solve(sigma);
   if (!result_.converged)
     throw NumericalError(fmt::format("the flow did not converge: error {:.2e} of {:.0e} asked for after {} iterations",
                                      result_.error, options_.tolerance, result_.iterations));
+  if (any_unheld) {  // to the last digit: a little force left over would add up
+    const RealVec now = means(solver_->state());
+    for (int a = 0; a < DIM; ++a) drift[a] -= now[a];
+    shift(solver_->state(), drift, unheld_axes);
+  }
   double change = 0, fastest = 0;
   for (int b = 0; b < mesh_->size(); ++b) {
     const auto [g, i] = solver_->hierarchy().place_of_block(b);
@@ -325,9 +543,10 @@ void Flow::solve(double elapsed) {
                         std::max(wanted, 0.5 * interval_), interval_ > 0 ? 2 * interval_ : 1e300});
 }
 
-void Flow::advance(double t, double, std::int64_t) {
-  const double elapsed = t - last_;
-  if (elapsed <= 0) return;  // at rest at the start
+void Flow::advance(double t, double dt, std::int64_t) {
+  // At rest at the start, unless walls push melt in: it must go somewhere from the first step on.
+  const double elapsed = t > last_ ? t - last_ : t == 0 && options_.through_walls(mesh_->shape()) ? dt : 0;
+  if (elapsed <= 0) return;
   if (!due_ && t < next_ * (1 - 1e-12)) return;
   solve(elapsed);
   measure_motion(*mesh_, psi_, v_, crystals_);

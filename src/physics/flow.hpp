@@ -21,8 +21,14 @@ enum class ViscosityLaw : std::uint8_t { h1, h2, h3, linear };
 /// of the same U holds, which has no dip inside the interface.
 enum class Buoyancy : std::uint8_t { mixture, liquid };
 
+/// How the velocity of a wall is spread over it.
+enum class Profile : std::uint8_t { uniform, parabolic };
+
+using Gradient = std::array<double, std::size_t{DIM} * DIM>;  ///< row by row: dv_x/dx, dv_x/dy, ...
+
 struct FlowOptions {
   std::optional<RealVec> velocity_um_s, velocity_w0_tau0;
+  std::optional<Gradient> velocity_gradient_per_tau0;
   double viscosity_ratio = 1e6;
   ViscosityLaw viscosity = ViscosityLaw::h3;
   Stress stress = Stress::symmetric;
@@ -35,27 +41,42 @@ struct FlowOptions {
   int max_iterations = 300;
   double courant = 0.5, max_interval_tau0 = 4, max_change = 0.05;
   std::array<std::optional<RealVec>, 6> wall_velocity_w0_tau0;  ///< those of z are read in 3D only
+  std::array<Profile, 6> wall_profile{};
+  std::optional<Gradient> wall_gradient_per_tau0;
+  RealVec initial_velocity_w0_tau0{};
+  double initial_vortex_w0_tau0 = 0;
 
   void declare(io::Schema& schema);
-  bool prescribed() const { return velocity_um_s || velocity_w0_tau0; }
+  bool prescribed() const { return velocity_um_s || velocity_w0_tau0 || velocity_gradient_per_tau0; }
+  /// Component `axis` of the velocity on a side that is a wall.
+  amr::SideValue wall_value(const amr::MeshShape& shape, int axis, int face) const;
+  /// Melt flows in or out through a wall.
+  bool through_walls(const amr::MeshShape& shape) const;
+  /// What these options ask of the sides of the box.
+  void check_sides(io::Checks& checks, const amr::MeshShape& shape) const;
 };
 
 /// nu/nu_l for a given phi.
 double relative_viscosity(ViscosityLaw law, double ratio, double phi);
 
-/// Provides the face field "velocity" (W0/tau0), uniform and constant.
+/// Provides the face field "velocity" (W0/tau0): constant in time, affine in space, free of divergence.
 class PrescribedFlow : public Module {
  public:
   PrescribedFlow(const FlowOptions& options, const Scales& scales, std::vector<Seed>& crystals);
   const char* name() const override { return "flow"; }
   void declare(amr::FieldTable& fields) override;
-  void attach(amr::Mesh& mesh, amr::GhostExchange&) override { mesh_ = &mesh; }
+  void attach(amr::Mesh& mesh, amr::GhostExchange&) override;
   void initialize() override { after_regrid(); }
   void after_regrid() override;
+  void advance(double t, double dt, std::int64_t step) override;
   void report(Report& r) const override;
 
  private:
+  RealVec velocity_at(const RealVec& x) const;
+
   RealVec velocity_{};
+  Gradient gradient_{};
+  std::vector<Seed>& crystals_;
   amr::FaceField v_;
   amr::Mesh* mesh_ = nullptr;
 };
@@ -71,6 +92,7 @@ class Flow : public Module {
   const char* name() const override { return "flow"; }
   void declare(amr::FieldTable& fields) override;
   void attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) override;
+  void initialize() override;
   void after_regrid() override;
   void advance(double t, double dt, std::int64_t step) override;
   void report(Report& r) const override;
@@ -85,6 +107,9 @@ class Flow : public Module {
   void set_viscosity();
   void set_force(double sigma);
   void add_inertia(int b);
+  Array<bool> unheld() const;
+  RealVec means(const amr::HierarchyField& f) const;
+  void shift(amr::HierarchyField& f, const RealVec& by, const Array<bool>& axes);
 
   FlowOptions options_;
   Scales scales_;

@@ -11,7 +11,7 @@ Modules make_modules(const Settings& s, std::vector<Seed>& seeds) {
   Modules m;
   if (s.has_flow() && s.flow.prescribed()) m.push_back(std::make_unique<PrescribedFlow>(s.flow, s.scales, seeds));
   if (s.has_flow() && !s.flow.prescribed()) m.push_back(std::make_unique<Flow>(s.flow, s.scales, seeds));
-  if (s.has_flow()) m.push_back(std::make_unique<Transport>(s.scales.k));
+  if (s.has_flow() && !s.phase_field.rigid) m.push_back(std::make_unique<Transport>(s.scales.k));
   m.push_back(std::make_unique<Solidification>(s.phase_field, s.solute, s.scales, seeds));
   return m;
 }

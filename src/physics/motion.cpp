@@ -115,6 +115,7 @@ Vector3 spin_of(const Vector3& l, const double* inertia) {
 }  // namespace
 
 void measure_motion(const amr::Mesh& mesh, amr::CellField psi, amr::FaceField velocity, std::vector<Seed>& crystals) {
+  if (crystals.empty()) return;
   const Solid solid(mesh, psi, velocity, crystals);
   constexpr std::size_t FIRST = 8, SECOND = 9, THIRD = 2;
   const std::vector<double> first = solid.sums(FIRST, [](double* sum, const Sample& s) {

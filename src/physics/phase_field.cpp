@@ -12,6 +12,11 @@ void PhaseFieldOptions::declare(io::Schema& schema) {
   io::Table& t = schema.table("phase_field", "Karma's phase field, eq. (1)", io::Schema::Presence::implied);
   t.real("anisotropy", anisotropy).range(0, 0.06).doc("eps4 of a_s = (1-3 eps)(1 + 4 eps/(1-3 eps) sum n_i^4); convex below 1/15");
   t.boolean("frozen", frozen).doc("no growth and no diffusion: crystals are only carried by the flow");
+  t.boolean("rigid", rigid)
+      .doc("frozen crystals keep the shape of their seeds: drawn anew where their motion takes them, U = -Omega everywhere; nothing else is carried");
+  schema.check({"phase_field"}, [this](io::Checks& checks) {
+    if (rigid && !frozen) checks.fail("phase_field.rigid", "only together with frozen = true");
+  });
   t.real("max_dt_tau0", max_dt_tau0).unit("tau0").above(0).at_most(1).doc("largest step of phase and solute; stable below about .3, whatever the spacing");
   t.real("noise", noise).at_least(0).at_most(10).doc("amplitude of a uniform random rate of psi in the interface, per sqrt(tau0 W0^d); 0: none");
   t.integer("noise_seed", noise_seed).doc("of the counter-based generator");
@@ -48,13 +53,12 @@ void set_seeds(amr::Mesh& mesh, amr::CellField psi, const std::vector<Seed>& see
   amr::for_each_cell({}, filled(layout.n), [&](const IntVec& c) {
     double value = -PSI_MAX;
     for (const Seed& s : seeds) {
-      double r2 = 0;
+      RealVec r{};
       for (int a = 0; a < DIM; ++a) {
-        double x = block.lo[a] + (c[a] + 0.5) * block.dx - s.position[a];
-        if (periodic[a]) x -= std::round(x / extent[a]) * extent[a];  // the nearest image
-        r2 += x * x;
+        r[a] = block.lo[a] + (c[a] + 0.5) * block.dx - s.position[a];
+        if (periodic[a]) r[a] -= std::round(r[a] / extent[a]) * extent[a];  // the nearest image
       }
-      value = std::max(value, s.radius - std::sqrt(r2));
+      value = std::max(value, s.depth(r));
     }
     p[layout.offset(c)] = std::min(value, PSI_MAX);
   });
@@ -106,7 +110,8 @@ void tag_seeds(const amr::Mesh& mesh, const std::vector<Seed>& seeds, double ban
       near2 += near * near;
       far2 += far * far;
     }
-    if (std::sqrt(near2) < s.radius + band && std::sqrt(far2) > s.radius - band)
+    const auto [along, across] = s.semi_axes();
+    if (std::sqrt(near2) < std::max(along, across) + band && std::sqrt(far2) > std::min(along, across) - band)
       tag.level = tag.keep = mesh.shape().max_level;
   }
 }

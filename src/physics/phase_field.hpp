@@ -11,7 +11,7 @@ namespace dendrift::physics {
 
 struct PhaseFieldOptions {
   double anisotropy = 0.05;
-  bool frozen = false;
+  bool frozen = false, rigid = false;
   double max_dt_tau0 = 0.24;
   double noise = 0;
   std::int64_t noise_seed = 1;

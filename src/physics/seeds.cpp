@@ -40,23 +40,58 @@ Matrix3 product(const Matrix3& a, const Matrix3& b) {
   return m;
 }
 
+// Signed, positive outside. The nearest point is (e0^2 y0/(t+e0^2), e1^2 y1/(t+e1^2)) with the largest root t of
+// (e0 y0/(t+e0^2))^2 + (e1 y1/(t+e1^2))^2 = 1, which falls in t (Eberly, Distance from a point to an ellipse).
+double distance_from_ellipse(std::array<double, 2> e, std::array<double, 2> y) {
+  if (e[0] < e[1]) {
+    std::swap(e[0], e[1]);
+    std::swap(y[0], y[1]);
+  }
+  const auto sum = [&](double t) {
+    const double a = e[0] * y[0] / (t + e[0] * e[0]), b = e[1] * y[1] / (t + e[1] * e[1]);
+    return a * a + b * b - 1;
+  };
+  const double side = std::hypot(y[0] / e[0], y[1] / e[1]) > 1 ? 1 : -1;
+  std::array<double, 2> nearest{};
+  const double focal = e[0] * e[0] - e[1] * e[1];
+  if (y[1] == 0 && e[0] * y[0] < focal) {  // between the centres of curvature of the long axis' ends
+    const double c = e[0] * y[0] / focal;
+    nearest = {e[0] * c, e[1] * std::sqrt(1 - c * c)};
+  } else {
+    double lo = -e[1] * e[1] + e[1] * y[1], hi = -e[1] * e[1] + std::hypot(e[0] * y[0], e[1] * y[1]);
+    for (int i = 0; i < 100 && lo < hi; ++i) {
+      const double t = 0.5 * (lo + hi);
+      if (t <= lo || t >= hi) break;
+      (sum(t) > 0 ? lo : hi) = t;
+    }
+    const double t = 0.5 * (lo + hi);
+    for (std::size_t i = 0; i < 2; ++i) nearest[i] = y[i] == 0 ? 0 : e[i] * e[i] * y[i] / (t + e[i] * e[i]);
+  }
+  return side * std::hypot(nearest[0] - y[0], nearest[1] - y[1]);
+}
+
 }  // namespace
 
 void SeedOptions::declare(io::Schema& schema, std::vector<SeedOptions>& seeds) {
   schema.list<SeedOptions>(
-      "seed", "a crystal at the start: a disc (sphere) with phi = tanh((R-r)/sqrt 2) and U = -Omega", seeds,
+      "seed", "a crystal at the start: a disc (sphere) with phi = tanh((R-r)/sqrt 2) and U = -Omega; needed unless there is [flow]", seeds,
       [](io::Table& t, SeedOptions& s) {
         t.reals("position_um", s.position_um).unit("um").doc("centre, from the low corner of the box; or position_W0");
         t.reals("position_W0", s.position_w0).unit("W0").doc("centre, from the low corner of the box");
         t.real("radius_um", s.radius_um).unit("um").above(0).doc("radius at phi = 0; or radius_W0");
         t.real("radius_W0", s.radius_w0).unit("W0").above(0).doc("radius at phi = 0");
+        t.real("aspect_ratio", s.aspect_ratio)
+            .range(0.05, 20)
+            .doc("of an ellipse (spheroid): semi-axis along crystal axis 0 over the others; radius is that of the same area (volume)");
         t.real("angle_deg", s.angle_deg).unit("degree").range(-360, 360).doc("turn about z, counterclockwise");
         t.reals("euler_deg", s.euler_deg)
             .unit("degree")
             .range(-360, 360)
             .doc("3D only: turns about z, then x, then z (Bunge), after angle_deg");
-      },
-      io::Schema::Presence::required);
+      });
+  schema.check({"seed"}, [&seeds](io::Checks& checks) {
+    if (seeds.empty() && !checks.has_table("flow")) checks.fail("seed", "at least one [[seed]], unless there is a table [flow]");
+  });
   schema.check([&seeds](io::Checks& checks) {
     for (std::size_t i = 0; i < seeds.size(); ++i) {
       const SeedOptions& s = seeds[i];
@@ -81,6 +116,7 @@ std::vector<Seed> make_seeds(const std::vector<SeedOptions>& options, const Scal
     for (int a = 0; a < DIM; ++a)
       s.position[a] = o.position_w0 ? (*o.position_w0)[a] : (*o.position_um)[a] / scales.w0_um;
     s.radius = o.radius_w0 ? *o.radius_w0 : *o.radius_um / scales.w0_um;
+    s.aspect_ratio = o.aspect_ratio;
     const Matrix3 about_z = rotation(2, o.angle_deg);
     const Matrix3 m = product(rotation(2, o.euler_deg[0]),
                               product(rotation(0, o.euler_deg[1]), product(rotation(2, o.euler_deg[2]), about_z)));
@@ -94,6 +130,24 @@ std::vector<Seed> make_seeds(const std::vector<SeedOptions>& options, const Scal
     seeds.push_back(s);
   }
   return seeds;
+}
+
+std::array<double, 2> Seed::semi_axes() const {
+  if (aspect_ratio == 1) return {radius, radius};
+  const double across = radius * std::pow(aspect_ratio, -1.0 / DIM);
+  return {across * aspect_ratio, across};
+}
+
+double Seed::depth(const RealVec& r) const {
+  double square = 0, along = 0;
+  for (int a = 0; a < DIM; ++a) {
+    square += r[a] * r[a];
+    along += r[a] * axes[0][a];
+  }
+  if (aspect_ratio == 1) return radius - std::sqrt(square);
+  constexpr double BULK = 30;  // W0: melt, whatever the exact distance
+  if (const double least = std::sqrt(square) - std::max(semi_axes()[0], semi_axes()[1]); least > BULK) return -least;
+  return -distance_from_ellipse(semi_axes(), {std::abs(along), std::sqrt(std::max(0.0, square - along * along))});
 }
 
 void Seed::advance(double dt) {

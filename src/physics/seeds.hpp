@@ -17,6 +17,7 @@ namespace dendrift::physics {
 struct SeedOptions {
   std::optional<RealVec> position_um, position_w0;
   std::optional<double> radius_um, radius_w0;
+  double aspect_ratio = 1;
   double angle_deg = 0;
   std::array<double, 3> euler_deg{};
 
@@ -26,7 +27,8 @@ struct SeedOptions {
 /// A crystal: as it starts, and how it moves.
 struct Seed {
   RealVec position{};     ///< of the point where it started, which moves with it, W0
-  double radius = 0;      ///< at the start, W0
+  double radius = 0;      ///< at the start, W0: of the disc (sphere) of the same size
+  double aspect_ratio = 1;  ///< at the start: semi-axis along crystal axis 0 over the others
   Array<RealVec> axes{};  ///< row i: crystal axis i in the frame of the mesh
   bool rotated = false;   ///< axes are not those of the mesh
   RealVec velocity{};     ///< of that point, W0/tau0
@@ -37,6 +39,10 @@ struct Seed {
 
   /// Moves and turns for a time dt.
   void advance(double dt);
+  /// Semi-axes at the start, along crystal axis 0 and across it.
+  std::array<double, 2> semi_axes() const;
+  /// Distance from the surface at the start, positive inside; r: place relative to the centre.
+  double depth(const RealVec& r) const;
 };
 
 /// Unit quaternion (real part first, >= 0) that turns the axes of the mesh into those of the crystal.

@@ -25,6 +25,10 @@ Solidification::Solidification(const PhaseFieldOptions& phase, const SoluteOptio
 }
 
 void Solidification::turn_axes() {
+  if (crystals_.empty()) {
+    for (int a = 0; a < DIM; ++a) parameters_.axes[a][a] = 1;
+    return;
+  }
   parameters_.axes = crystals_.front().axes;
   parameters_.rotated = crystals_.front().rotated;
 }
@@ -47,9 +51,11 @@ void Solidification::attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) {
   if (const auto v = mesh.fields().find("velocity_x")) velocity_.id = *v;
 }
 
-void Solidification::initialize() {
+void Solidification::initialize() { draw(crystals_); }
+
+void Solidification::draw(const std::vector<Seed>& crystals) {
   amr::parallel_for(mesh_->size(), [&](int b) {
-    set_seeds(*mesh_, psi_, crystals_, b);
+    set_seeds(*mesh_, psi_, crystals, b);
     set_uniform_supersaturation(*mesh_, psi_, c_, scales_, b);
   });
 }
@@ -146,6 +152,11 @@ void Solidification::run_stage(const Stage& stage, double noise, std::uint64_t n
 }
 
 void Solidification::advance(double, double dt, std::int64_t step) {
+  if (phase_.rigid) {  // where they are at the end of the step
+    std::vector<Seed> moved = crystals_;
+    for (Seed& s : moved) s.advance(dt);
+    draw(moved);
+  }
   if (phase_.frozen) return;
   turn_axes();
   const double dx = mesh_->shape().dx(mesh_->shape().max_level);
@@ -183,6 +194,16 @@ void Solidification::tag(int b, amr::Tag& tag) const {
 }
 
 double Solidification::front_speed() {
+  if (phase_.rigid) {
+    double fastest = 0;
+    for (const Seed& s : crystals_) {
+      const auto [along, across] = s.semi_axes();
+      double speed = std::hypot(s.spin[0], s.spin[1], s.spin[2]) * std::max(along, across), square = 0;
+      for (const double v : s.velocity) square += v * v;
+      fastest = std::max(fastest, speed + std::sqrt(square));
+    }
+    return fastest;
+  }
   if (phase_.frozen) return 0;
   const int n = mesh_->layout().n;
   const double band = phase_.band();

@@ -45,6 +45,7 @@ class Solidification : public Module {
 
  private:
   void turn_axes();
+  void draw(const std::vector<Seed>& crystals);
   AlloyBlock block_arrays(int b) const;
   void run_stage(const Stage& stage, double noise, std::uint64_t noise_key, bool measure);
 

@@ -44,8 +44,8 @@ class StokesSolver {
   amr::HierarchyField& state() { return state_; }  ///< v and p; the first guess, then the solution, ghosts filled
   amr::HierarchyField& force() { return force_; }  ///< f on the faces of the leaves
 
-  /// Velocity of a wall along itself (moving walls); through it always 0.
-  void set_wall_velocity(int axis, int face, double value) { state_.set_side(axis, face, value); }
+  /// A component of the velocity on a wall. Through walls alone, as much must flow in as out.
+  void set_wall_velocity(int axis, int face, const amr::SideValue& value) { state_.set_side(axis, face, value); }
 
   /// `phase(b, cell array)`: writes phi of local block b, two layers of ghosts included; `law(phi)`: the viscosity.
   void set_viscosity(const std::function<void(int b, double* phi)>& phase, const std::function<double(double)>& law);

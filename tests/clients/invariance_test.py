@@ -85,6 +85,28 @@ angle_deg = 20
 max_interval_tau0 = 0.4
 gravity_um_s2 = 3e9
 """),
+    # melt that comes in, goes out and shears, and a crystal of another shape
+    "2D shear": (dict(lines=0.5, steps=81, omega=0.4), """
+[mesh]
+dim = 2
+size_W0 = [64, 128]
+root_blocks = [1, 2]
+levels = 4
+block_cells = 8
+max_regrid_steps = 4
+yhi = "open"
+[[seed]]
+position_W0 = [28, 80]
+radius_W0 = 8
+aspect_ratio = 1.5
+angle_deg = 20
+[flow]
+wall_gradient_per_tau0 = [0.02, 0.03, 0.01, -0.02]
+ylo_velocity_W0_tau0 = [0, 0.4]
+ylo_profile = "parabolic"
+max_interval_tau0 = 0.4
+gravity_um_s2 = 1e7
+"""),
     "3D growth": (dict(lines=0.2, steps=41, omega=0.3), """
 [mesh]
 dim = 3
