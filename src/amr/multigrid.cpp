@@ -18,6 +18,7 @@ struct Operator {
   Array<const double*> other{};  // coupled: the component along each axis, null for our own
   Array<std::ptrdiff_t> stride{};
   Array<double> factor{};  // of kappa, over dx^2
+  const double* drag = nullptr;
   double sigma = 0;
 
   [[gnu::always_inline]] double below(int a, std::ptrdiff_t q) const { return kappa[a] == nullptr ? factor[a] : factor[a] * kappa[a][q]; }
@@ -26,7 +27,7 @@ struct Operator {
 // A x at place q.
 template <int K>
 [[gnu::always_inline]] inline double apply(const Operator& o, const double* x, std::ptrdiff_t q) {
-  double sum = o.sigma * x[q];
+  double sum = (o.sigma + o.drag[q]) * x[q];
   for (int a = 0; a < DIM; ++a) {
     const std::ptrdiff_t s = o.stride[a];
     if (K == CONSTANT) {
@@ -84,7 +85,8 @@ Multigrid::Multigrid(Hierarchy& hierarchy, std::vector<Component> components, co
                      MultigridOptions options)
     : h_(hierarchy), coefficients_(coefficients), options_(options),
       x_(hierarchy, components), rhs_(hierarchy, components), step_(hierarchy, components),
-      residual_(hierarchy, components), inverse_(hierarchy, components) {}
+      residual_(hierarchy, components), inverse_(hierarchy, components),
+      no_drag_(static_cast<std::size_t>(hierarchy.grid(0).layout.size()), 0.0) {}
 
 template <class F>
 void Multigrid::with_operator(const HierarchyField& x, int g, int i, int c, F&& f) const {
@@ -92,6 +94,7 @@ void Multigrid::with_operator(const HierarchyField& x, int g, int i, int c, F&& 
   const Grid& grid = h_.grid(g);
   Operator o;
   o.sigma = l.sigma;
+  o.drag = drag_ != nullptr ? drag_->at(g, i, c) : no_drag_.data() + grid.layout.interior();
   bool constant = true;
   for (int a = 0; a < DIM; ++a) {
     o.stride[a] = grid.layout.stride(a);
@@ -123,8 +126,9 @@ void Multigrid::rows(int g, const Range& box, F&& f) const {
   });
 }
 
-void Multigrid::prepare(std::vector<Links> links) {
+void Multigrid::prepare(std::vector<Links> links, const HierarchyField* drag) {
   links_ = std::move(links);
+  drag_ = drag;
   for (int g = 0; g < h_.grids(); ++g)
     parallel_for(h_.grid(g).size(), [&](int i) {
       for (int c = 0; c < x_.components(); ++c)
@@ -132,7 +136,7 @@ void Multigrid::prepare(std::vector<Links> links) {
           double* inverse = inverse_.at(g, i, c);
           rows(g, h_.unknowns(g, i, x_.component(c), false), [&](std::ptrdiff_t q0, int count) {
             for (std::ptrdiff_t q = q0; q < q0 + count; ++q) {
-              double d = o.sigma;
+              double d = o.sigma + o.drag[q];
               for (int a = 0; a < DIM; ++a)
                 d += (o.other[a] != nullptr ? 2 : 1) * (o.below(a, q) + o.below(a, q + o.stride[a]));
               inverse[q] = 1 / d;
@@ -174,7 +178,7 @@ void Multigrid::prepare_bottom() {
     };
     with_operator(x_, g, i, c, [&](const Operator& o, auto) {
       const double* x = x_.at(g, i, c);
-      add(x, q, o.sigma);
+      add(x, q, o.sigma + o.drag[q]);
       for (int a = 0; a < DIM; ++a) {
         const std::ptrdiff_t s = o.stride[a];
         for (const int side : {0, 1}) {

@@ -35,8 +35,9 @@ class Multigrid {
   Multigrid(Hierarchy& hierarchy, std::vector<Component> components, const HierarchyField& coefficients,
             MultigridOptions options = {});
 
-  /// Call before the first cycle, and when the coefficients or sigma have changed.
-  void prepare(std::vector<Links> links);
+  /// Call before the first cycle, and when the coefficients or sigma have changed. `drag`: added to sigma place by place,
+  /// components as x; it has to live as long as cycles are asked for.
+  void prepare(std::vector<Links> links, const HierarchyField* drag = nullptr);
   /// Right-hand side on the leaves (the rest is overwritten); zero where nothing is unknown.
   HierarchyField& rhs() { return rhs_; }
   /// One cycle from zero; the result is in solution(), on the leaves of all grids.
@@ -62,6 +63,8 @@ class Multigrid {
   std::vector<Links> links_;
   MultigridOptions options_;
   HierarchyField x_, rhs_, step_, residual_, inverse_;
+  const HierarchyField* drag_ = nullptr;
+  std::vector<double> no_drag_;  // zeros for any block
   SparseSolver bottom_;
   std::vector<double> bottom_values_;
 };

@@ -45,6 +45,10 @@ void FlowOptions::declare(io::Schema& schema) {
   t.reals("velocity_gradient_per_tau0", velocity_gradient_per_tau0)
       .unit("1/tau0")
       .doc("prescribed, on top of it: dvx/dx, dvx/dy, ..., dvy/dx, ... about the middle of the box; nothing is solved");
+  t.choice("solid", solid, {{"viscous", SolidModel::viscous}, {"penalised", SolidModel::penalised}})
+      .doc("what keeps crystals rigid: their viscosity, or a resistance against all that is not rigid motion");
+  t.choice("motion", motion, {{"free", Motion::free}, {"held", Motion::held}})
+      .doc("of crystals; held: a resistance keeps them in place, whatever `solid` says, and they weigh nothing");
   t.real("viscosity_ratio", viscosity_ratio).range(1, 1e9).doc("viscosity of the solid over that of the melt");
   t.choice("viscosity", viscosity, {{"h3", ViscosityLaw::h3}, {"h2", ViscosityLaw::h2}, {"h1", ViscosityLaw::h1},
                                     {"linear", ViscosityLaw::linear}})
@@ -170,6 +174,15 @@ double relative_viscosity(ViscosityLaw law, double ratio, double phi) {
   return (a + b) / (a / ratio + b);
 }
 
+double relative_drag(double phi) {
+  const double f = std::clamp(0.5 * (1 + phi), 0.0, 1.0), l = 1 - f;
+  constexpr double SLOPE = 0.63 * 9, MOST = 100, NOTHING = 1e-6;
+  const double drag = SLOPE * f * f * f;
+  const double melt = l * l * l;
+  if (drag >= MOST * melt) return MOST;
+  return drag > NOTHING * melt ? drag / melt : 0.0;
+}
+
 PrescribedFlow::PrescribedFlow(const FlowOptions& o, const Scales& scales, std::vector<Seed>& crystals) : crystals_(crystals) {
   for (int a = 0; a < DIM; ++a) {
     if (o.velocity_w0_tau0) velocity_[a] = (*o.velocity_w0_tau0)[a];
@@ -236,7 +249,7 @@ void PrescribedFlow::report(Report& r) const {
 Flow::Flow(const FlowOptions& o, const Scales& s, std::vector<Seed>& crystals) : options_(o), scales_(s), crystals_(crystals) {
   const double time2 = s.tau0_s * s.tau0_s;
   solutal_ = o.solutal_buoyancy ? o.solutal_expansion_per_wt * s.c_l_wt : 0.0;
-  weight_ = o.solid_weight ? o.solid_density_ratio - 1 : 0.0;
+  weight_ = o.solid_weight && o.motion == Motion::free ? o.solid_density_ratio - 1 : 0.0;
   gravity_[DIM - 1] = -o.gravity_um_s2 * time2 / s.w0_um;
 }
 
@@ -325,7 +338,7 @@ void Flow::recall(const std::vector<double>& m) {
 void Flow::load() {
   if (solver_ == nullptr) {
     StokesOptions o;
-    o.stress = options_.stress;
+    o.stress = penalised() ? Stress::laplacian : options_.stress;  // the same where the viscosity is uniform
     o.tolerance = options_.tolerance;
     o.max_iterations = options_.max_iterations;
     solver_ = std::make_unique<StokesSolver>(*mesh_, o);
@@ -375,13 +388,18 @@ void Flow::extrapolate(double elapsed) {
 
 void Flow::set_viscosity() {
   const amr::Layout& layout = mesh_->layout();
-  solver_->set_viscosity(
-      [&](int b, double* phi) {
-        const double* psi = mesh_->cells(psi_, b) - layout.interior();
-        double* out = phi - layout.interior();
-        for (std::ptrdiff_t q = 0; q < layout.size(); ++q) out[q] = phi_of_psi(psi[q]);
-      },
-      [&](double phi) { return scales_.viscosity * relative_viscosity(options_.viscosity, options_.viscosity_ratio, phi); });
+  const auto phase = [&](int b, double* phi) {
+    const double* psi = mesh_->cells(psi_, b) - layout.interior();
+    double* out = phi - layout.interior();
+    for (std::ptrdiff_t q = 0; q < layout.size(); ++q) out[q] = phi_of_psi(psi[q]);
+  };
+  const double nu = scales_.viscosity, ratio = penalised() ? 1.0 : options_.viscosity_ratio;
+  solver_->set_viscosity(phase, [&](double phi) { return nu * relative_viscosity(options_.viscosity, ratio, phi); });
+  if (!penalised()) return;
+  std::vector<RealVec> centres;
+  if (options_.motion == Motion::free)
+    for (const Seed& crystal : crystals_) centres.push_back(crystal.position);
+  solver_->set_drag(phase, [&](double phi) { return nu * relative_drag(phi); }, centres);
 }
 
 // Eqs. (5) and (6): what is known of the momentum at the end of the interval.
@@ -549,7 +567,7 @@ void Flow::advance(double t, double dt, std::int64_t) {
   if (elapsed <= 0) return;
   if (!due_ && t < next_ * (1 - 1e-12)) return;
   solve(elapsed);
-  measure_motion(*mesh_, psi_, v_, crystals_);
+  measure_motion(*mesh_, psi_, options_.motion == Motion::held ? amr::FaceField{} : v_, crystals_);
   last_ = t;
   next_ = t + interval_;
   due_ = false;

@@ -24,11 +24,18 @@ enum class Buoyancy : std::uint8_t { mixture, liquid };
 /// How the velocity of a wall is spread over it.
 enum class Profile : std::uint8_t { uniform, parabolic };
 
+/// What keeps solid rigid: its viscosity, or a resistance against everything but a rigid motion in a melt without solid.
+enum class SolidModel : std::uint8_t { viscous, penalised };
+
+enum class Motion : std::uint8_t { free, held };
+
 using Gradient = std::array<double, std::size_t{DIM} * DIM>;  ///< row by row: dv_x/dx, dv_x/dy, ...
 
 struct FlowOptions {
   std::optional<RealVec> velocity_um_s, velocity_w0_tau0;
   std::optional<Gradient> velocity_gradient_per_tau0;
+  SolidModel solid = SolidModel::viscous;
+  Motion motion = Motion::free;
   double viscosity_ratio = 1e6;
   ViscosityLaw viscosity = ViscosityLaw::h3;
   Stress stress = Stress::symmetric;
@@ -58,6 +65,10 @@ struct FlowOptions {
 
 /// nu/nu_l for a given phi.
 double relative_viscosity(ViscosityLaw law, double ratio, double phi);
+
+/// kappa W0^2/nu_l for a given phi: .63 n^2 s/(1-s), n = 3, s = f^3/(f^3 + (1-f)^3), and no more than 100. A disc then has
+/// the drag of one of its own radius.
+double relative_drag(double phi);
 
 /// Provides the face field "velocity" (W0/tau0): constant in time, affine in space, free of divergence.
 class PrescribedFlow : public Module {
@@ -105,6 +116,7 @@ class Flow : public Module {
   void store(double elapsed);
   void extrapolate(double elapsed);
   void set_viscosity();
+  bool penalised() const { return options_.solid == SolidModel::penalised || options_.motion == Motion::held; }
   void set_force(double sigma);
   void add_inertia(int b);
   Array<bool> unheld() const;

@@ -15,6 +15,9 @@ namespace {
 
 std::size_t at(int i) { return static_cast<std::size_t>(i); }
 
+// Least sigma + kappa in the pressure's preconditioner, over the largest kappa: so that steady flow has one as well.
+constexpr double FAINT = 1e-6;
+
 constexpr int EDGES = DIM == 2 ? 1 : 3;  // pairs of axes
 
 // Component of viscosity_ that holds the edges along which neither a nor b changes; 0 is the cells.
@@ -49,11 +52,9 @@ StokesSolver::StokesSolver(const amr::Mesh& mesh, const StokesOptions& options)
       pressure_(hierarchy_, {components_[DIM]}) {
   for (const amr::Side s : mesh.shape().sides) closed_ = closed_ && s != amr::Side::open;
   velocity_cycle_ = std::make_unique<amr::Multigrid>(hierarchy_, velocities(components_), viscosity_);
-  amr::Links laplacian;
-  for (auto& along : laplacian.along) along.factor = 1;
   pressure_cycle_ = std::make_unique<amr::Multigrid>(hierarchy_, std::vector<Component>{components_[DIM]},
                                                      viscosity_, amr::MultigridOptions{.smoothings = 1});
-  pressure_cycle_->prepare({laplacian});
+  pressure_cycle_->prepare({amr::Links{}});
   gmres_.residual = [this](const Vector& x, Vector& r) {
     unpack(x, state_);
     hierarchy_.make_composite(state_, 1, false);
@@ -177,6 +178,60 @@ void StokesSolver::set_viscosity(const std::function<void(int, double*)>& phase,
   set_up_pieces();
 }
 
+void StokesSolver::set_drag(const std::function<void(int, double*)>& phase, const std::function<double(double)>& law,
+                            const std::vector<RealVec>& centres) {
+  std::vector<Component> faces(DIM);
+  for (int a = 0; a < DIM; ++a) faces[at(a)].normal = a;
+  if (drag_ == nullptr) {
+    drag_ = std::make_unique<HierarchyField>(hierarchy_, faces);
+    mobility_ = std::make_unique<HierarchyField>(hierarchy_, faces);
+    pressure_cycle_ = std::make_unique<amr::Multigrid>(hierarchy_, std::vector<Component>{components_[DIM]}, *mobility_);
+  }
+  for_leaves([&](int b, int g, int i, double) {
+    const Layout& layout = hierarchy_.grid(g).layout;
+    thread_local std::vector<double> phi_array;
+    phi_array.resize(static_cast<std::size_t>(layout.size()));
+    double* phi = phi_array.data() + layout.interior();
+    phase(b, phi);
+    for (int a = 0; a < DIM; ++a) {
+      double* kappa = drag_->at(g, i, a);
+      amr::for_each_cell(filled(1 - Layout::GHOSTS), filled(layout.pitch() - 1), [&](const IntVec& c) {
+        const double* p = phi + layout.offset(c);
+        kappa[layout.offset(c)] = law(0.5 * (p[0] + p[-layout.stride(a)]));
+      });
+    }
+  });
+  double largest = 0;
+  for (int b = 0; b < mesh_.size(); ++b) {
+    const auto [g, i] = hierarchy_.place_of_block(b);
+    for (int a = 0; a < DIM; ++a)
+      amr::for_each_cell({}, filled(mesh_.layout().n), [&](const IntVec& q) {
+        largest = std::max(largest, drag_->at(g, i, a)[mesh_.layout().offset(q)]);
+      });
+  }
+  largest_drag_ = std::max(amr::global_max(largest, mesh_.comm()), 1e-300);
+  for (int g = 0; g + 1 < hierarchy_.grids(); ++g) hierarchy_.restrict_means(*drag_, *drag_, g);
+  for (int g = 0; g < hierarchy_.grids(); ++g) hierarchy_.exchange(*drag_, g, 1);
+  bodies_.build(hierarchy_, *drag_, centres);
+}
+
+// -div[1/(sigma + kappa) grad], which the solid's drag stops.
+void StokesSolver::prepare_pressure() {
+  for (int g = 0; g < hierarchy_.grids(); ++g)
+    amr::parallel_for(hierarchy_.grid(g).size(), [&](int i) {
+      const Layout& layout = hierarchy_.grid(g).layout;
+      const std::ptrdiff_t origin = layout.interior();
+      for (int a = 0; a < DIM; ++a) {
+        const double* kappa = drag_->at(g, i, a) - origin;
+        double* m = mobility_->at(g, i, a) - origin;
+        for (std::ptrdiff_t q = 0; q < layout.size(); ++q) m[q] = 1 / std::max(sigma_ + kappa[q], FAINT * largest_drag_);
+      }
+    });
+  amr::Links links;
+  for (int a = 0; a < DIM; ++a) links.along[a].field = a;
+  pressure_cycle_->prepare({links});
+}
+
 void StokesSolver::set_up_pieces() {
   pieces_.first.assign(1, 0);
   pieces_.weight.clear();
@@ -228,10 +283,11 @@ void StokesSolver::unpack(const Vector& v, HierarchyField& f) const {
   });
 }
 
-// y = K x, or b - K x, on the leaves' unknowns. Ghosts of x are filled.
-void StokesSolver::apply(const HierarchyField& x, const HierarchyField* b, HierarchyField& y) const {
+// y = K x, or rhs - K x, on the leaves' unknowns. Ghosts of x are filled.
+void StokesSolver::apply(const HierarchyField& x, const HierarchyField* rhs, HierarchyField& y) {
   const bool symmetric = options_.stress == Stress::symmetric;
-  for_leaves([&](int, int g, int i, double dx) {
+  if (!bodies_.empty()) bodies_.fit(x);
+  for_leaves([&](int b, int g, int i, double dx) {
     const Layout& layout = hierarchy_.grid(g).layout;
     const double h = 1 / dx, h2 = h * h;
     const double* nu = viscosity_.at(g, i, 0);
@@ -264,8 +320,13 @@ void StokesSolver::apply(const HierarchyField& x, const HierarchyField* b, Hiera
               out[q] -= h2 * (edge[q + t] * (v[q + t] - v[q]) - edge[q] * (v[q] - v[q - t]));
           }
         }
+        if (drag_ == nullptr) return;
+        const double* kappa = drag_->at(g, i, a);
+#pragma omp simd
+        for (std::ptrdiff_t q = q0; q < q0 + r.size[0]; ++q) out[q] += kappa[q] * v[q];
       });
     }
+    if (!bodies_.empty()) bodies_.subtract(b, y);
     double* div = y.at(g, i, PRESSURE);
     amr::for_each_row(filled(layout.n), [&](const IntVec& row) {
       const std::ptrdiff_t q0 = layout.offset(row);
@@ -278,10 +339,10 @@ void StokesSolver::apply(const HierarchyField& x, const HierarchyField* b, Hiera
         div[q] = h * sum;
       }
     });
-    if (b == nullptr) return;
+    if (rhs == nullptr) return;
     for (int c = 0; c <= DIM; ++c) {
       const Range r = hierarchy_.unknowns(g, i, components_[at(c)], true);
-      const double* f = b->at(g, i, c);
+      const double* f = rhs->at(g, i, c);
       double* out = y.at(g, i, c);
       amr::for_each_cell(r.lo, r.size, [&](const IntVec& q) {
         const std::ptrdiff_t o = layout.offset(q);
@@ -315,7 +376,9 @@ void StokesSolver::remove_mean_pressure(HierarchyField& f) const {
 // In place: pressure from the divergence, then velocities from what the pressure leaves of the momentum.
 void StokesSolver::precondition(HierarchyField& r) {
   const IntVec whole = filled(mesh_.layout().n + 1);
-  if (sigma_ > 0) {
+  const bool cycle = sigma_ > 0 || drag_ != nullptr;
+  const double factor = drag_ != nullptr ? 1.0 : sigma_;  // of -div grad, or it is in the mobility
+  if (cycle) {
     remove_mean_pressure(r);
     for_leaves([&](int, int g, int i, double) {
       amr::copy_box(pressure_cycle_->rhs().ref(g, i, 0), {}, std::as_const(r).ref(g, i, PRESSURE), {}, filled(mesh_.layout().n));
@@ -328,7 +391,7 @@ void StokesSolver::precondition(HierarchyField& r) {
     double* p = pressure_.at(g, i, 0);
     amr::for_each_cell({}, filled(layout.n), [&](const IntVec& q) {
       const std::ptrdiff_t o = layout.offset(q);
-      p[o] = nu[o] * d[o] + (sigma_ > 0 ? sigma_ * lap[o] : 0.0);
+      p[o] = nu[o] * d[o] + (cycle ? factor * lap[o] : 0.0);
     });
   });
   hierarchy_.make_composite(pressure_, 1, true);
@@ -358,7 +421,8 @@ void StokesSolver::precondition(HierarchyField& r) {
 
 StokesResult StokesSolver::solve(double sigma) {
   sigma_ = sigma;
-  velocity_cycle_->prepare(velocity_links(sigma));
+  velocity_cycle_->prepare(velocity_links(sigma), drag_.get());
+  if (drag_ != nullptr) prepare_pressure();
   Vector x;
   pack(state_, x);
   // The norm of the velocity alone: what the error of the solution is measured against.

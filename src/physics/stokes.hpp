@@ -12,6 +12,7 @@
 #include "amr/hierarchy.hpp"
 #include "amr/krylov.hpp"
 #include "amr/multigrid.hpp"
+#include "physics/rigid_bodies.hpp"
 
 namespace dendrift::physics {
 
@@ -50,6 +51,11 @@ class StokesSolver {
   /// `phase(b, cell array)`: writes phi of local block b, two layers of ghosts included; `law(phi)`: the viscosity.
   void set_viscosity(const std::function<void(int b, double* phi)>& phase, const std::function<double(double)>& law);
 
+  /// Adds kappa (v - v_rigid) to the left side, kappa = law(phi on the face). v_rigid: for the faces nearest to each centre
+  /// the rigid motion that leaves no net force and torque; without centres 0, which holds the solid in its place.
+  void set_drag(const std::function<void(int b, double* phi)>& phase, const std::function<double(double)>& law,
+                const std::vector<RealVec>& centres);
+
   StokesResult solve(double sigma);
   /// Fills parents and ghosts of state(). Collective.
   void fill_state() { hierarchy_.make_composite(state_, amr::Layout::GHOSTS, false); }
@@ -58,7 +64,8 @@ class StokesSolver {
   using Vector = amr::Gmres::Vector;
   void set_up_pieces();
   std::vector<amr::Links> velocity_links(double sigma) const;
-  void apply(const amr::HierarchyField& x, const amr::HierarchyField* b, amr::HierarchyField& y) const;
+  void prepare_pressure();
+  void apply(const amr::HierarchyField& x, const amr::HierarchyField* rhs, amr::HierarchyField& y);
   void precondition(amr::HierarchyField& r);
   void pack(const amr::HierarchyField& f, Vector& v) const;
   void unpack(const Vector& v, amr::HierarchyField& f) const;
@@ -71,10 +78,12 @@ class StokesSolver {
   amr::Hierarchy hierarchy_;
   std::vector<amr::Component> components_;
   amr::HierarchyField state_, force_, work_, image_, viscosity_, pressure_;
+  std::unique_ptr<amr::HierarchyField> drag_, mobility_;  // on faces: kappa and 1/(sigma + kappa)
+  RigidBodies bodies_;
   std::unique_ptr<amr::Multigrid> velocity_cycle_, pressure_cycle_;
   amr::Pieces pieces_;
   amr::Gmres gmres_;
-  double sigma_ = 0;
+  double sigma_ = 0, largest_drag_ = 0;
   bool closed_ = true;  // pressure known up to a constant
 };
 

@@ -1,0 +1,121 @@
+#include "physics/rigid_bodies.hpp"
+
+#include <Eigen/Dense>
+#include <cmath>
+
+#include "amr/comm.hpp"
+#include "amr/loops.hpp"
+
+namespace dendrift::physics {
+
+namespace {
+std::size_t at(int i) { return static_cast<std::size_t>(i); }
+}  // namespace
+
+// The face's velocity is the product of this with a motion: e_a . (V + W x r).
+RigidMotion RigidBodies::mode(const Face& f) {
+  RigidMotion m{};
+  m[at(f.axis)] = 1;
+  if constexpr (DIM == 2) {
+    m[2] = f.axis == 0 ? -f.arm[1] : f.arm[0];
+  } else {
+    const int b = (f.axis + 1) % 3, c = (f.axis + 2) % 3;  // (W x r)_a = W_b r_c - W_c r_b
+    m[at(3 + b)] = f.arm[at(c)];
+    m[at(3 + c)] = -f.arm[at(b)];
+  }
+  return m;
+}
+
+void RigidBodies::build(const amr::Hierarchy& hierarchy, const amr::HierarchyField& drag, const std::vector<RealVec>& centres) {
+  hierarchy_ = &hierarchy;
+  const amr::Mesh& mesh = hierarchy.mesh();
+  const amr::Layout& layout = mesh.layout();
+  const RealVec lo = mesh.shape().lo, hi = mesh.shape().hi();
+  const Array<bool> periodic = mesh.shape().periodic();
+  faces_.assign(at(mesh.size()), {});
+  motions_.assign(centres.size(), {});
+  if (centres.empty()) return;
+  std::vector<std::vector<double>> parts(at(mesh.size()));
+  constexpr std::size_t MOMENTS = std::size_t{RIGID} * RIGID;
+  amr::parallel_for(mesh.size(), [&](int b) {
+    const auto [g, i] = hierarchy.place_of_block(b);
+    const amr::Block& block = mesh.block(b);
+    for (int axis = 0; axis < DIM; ++axis) {
+      const double* k = drag.at(g, i, axis);
+      amr::Component component = drag.component(axis);
+      const amr::Range r = hierarchy.unknowns(g, i, component, true);
+      amr::for_each_cell(r.lo, r.size, [&](const IntVec& q) {
+        const std::ptrdiff_t place = layout.offset(q);
+        if (k[place] <= 0) return;
+        Face f{place, axis, 0, k[place], std::pow(block.dx, DIM), {}};
+        double least = 1e300;
+        for (std::size_t n = 0; n < centres.size(); ++n) {
+          RealVec arm{};
+          double square = 0;
+          for (int a = 0; a < DIM; ++a) {
+            arm[a] = block.lo[a] + (q[a] + (a == axis ? 0.0 : 0.5)) * block.dx - centres[n][a];
+            if (periodic[a]) arm[a] -= (hi[a] - lo[a]) * std::round(arm[a] / (hi[a] - lo[a]));
+            square += arm[a] * arm[a];
+          }
+          if (square >= least) continue;
+          least = square;
+          f.arm = arm;
+          f.body = static_cast<int>(n);
+        }
+        faces_[at(b)].push_back(f);
+        std::vector<double>& part = parts[at(b)];
+        part.resize(MOMENTS * centres.size());
+        const RigidMotion m = mode(f);
+        for (std::size_t u = 0; u < RIGID; ++u)
+          for (std::size_t v = 0; v < RIGID; ++v) part[at(f.body) * MOMENTS + u * RIGID + v] += f.drag * f.volume * m[u] * m[v];
+      });
+    }
+  });
+  std::vector<amr::ExactSum> total(MOMENTS * centres.size());
+  for (const std::vector<double>& part : parts)
+    for (std::size_t k = 0; k < part.size(); ++k) total[k].add(part[k]);
+  const std::vector<double> sums = amr::exact_sums(total, mesh.comm());
+  inverse_.assign(centres.size(), {});
+  for (std::size_t n = 0; n < centres.size(); ++n) {
+    using Matrix = Eigen::Matrix<double, RIGID, RIGID, Eigen::RowMajor>;
+    const Eigen::Map<const Matrix> moments(sums.data() + n * MOMENTS);
+    if (moments.trace() > 0) Eigen::Map<Matrix>(inverse_[n].data()) = moments.ldlt().solve(Matrix::Identity());
+  }
+}
+
+void RigidBodies::fit(const amr::HierarchyField& v) {
+  const amr::Mesh& mesh = hierarchy_->mesh();
+  std::vector<std::vector<double>> parts(at(mesh.size()));
+  amr::parallel_for(mesh.size(), [&](int b) {
+    if (faces_[at(b)].empty()) return;
+    const auto [g, i] = hierarchy_->place_of_block(b);
+    std::vector<double>& part = parts[at(b)];
+    part.resize(RIGID * motions_.size());
+    for (const Face& f : faces_[at(b)]) {
+      const double load = f.drag * f.volume * v.at(g, i, f.axis)[f.place];
+      const RigidMotion m = mode(f);
+      for (std::size_t u = 0; u < RIGID; ++u) part[at(f.body) * RIGID + u] += load * m[u];
+    }
+  });
+  std::vector<amr::ExactSum> total(RIGID * motions_.size());
+  for (const std::vector<double>& part : parts)
+    for (std::size_t k = 0; k < part.size(); ++k) total[k].add(part[k]);
+  const std::vector<double> sums = amr::exact_sums(total, mesh.comm());
+  for (std::size_t n = 0; n < motions_.size(); ++n)
+    for (std::size_t u = 0; u < RIGID; ++u) {
+      motions_[n][u] = 0;
+      for (std::size_t w = 0; w < RIGID; ++w) motions_[n][u] += inverse_[n][u * RIGID + w] * sums[n * RIGID + w];
+    }
+}
+
+void RigidBodies::subtract(int b, amr::HierarchyField& y) const {
+  const auto [g, i] = hierarchy_->place_of_block(b);
+  for (const Face& f : faces_[at(b)]) {
+    const RigidMotion m = mode(f);
+    double rigid = 0;
+    for (std::size_t u = 0; u < RIGID; ++u) rigid += m[u] * motions_[at(f.body)][u];
+    y.at(g, i, f.axis)[f.place] -= f.drag * rigid;
+  }
+}
+
+}  // namespace dendrift::physics
