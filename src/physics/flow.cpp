@@ -63,6 +63,10 @@ void FlowOptions::declare(io::Schema& schema) {
   t.boolean("inertia", inertia).doc("v.grad v in the momentum equation");
   t.choice("buoyancy", buoyancy, {{"mixture", Buoyancy::mixture}, {"liquid", Buoyancy::liquid}})
       .doc("excess of solute inside the interface: c as it is (the print), or of liquid of the same U");
+  t.choice("coupling", coupling, {{"coupled", Coupling::coupled}, {"projection", Coupling::projection}})
+      .doc("of velocity and pressure; projection is cheaper a step, and wrong by the splitting");
+  t.integer("projections", projections).range(1, 100).doc("passes of each step with coupling = \"projection\"");
+  t.boolean("rotational", rotational).doc("the projection's pressure takes -nu div v as well");
   t.real("tolerance", tolerance).range(1e-12, 0.1).doc("preconditioned residual of a solution over the norm of the velocity; crystals err by some 30 times as much");
   t.integer("max_iterations", max_iterations).at_least(1).doc("of a solution; more is a numerical failure");
   t.real("courant", courant).range(0.01, 10).doc("cells that the melt moves between two solutions at most");
@@ -341,6 +345,9 @@ void Flow::load() {
     o.stress = penalised() ? Stress::laplacian : options_.stress;  // the same where the viscosity is uniform
     o.tolerance = options_.tolerance;
     o.max_iterations = options_.max_iterations;
+    o.coupling = options_.coupling;
+    o.passes = options_.projections;
+    o.rotational = options_.rotational;
     solver_ = std::make_unique<StokesSolver>(*mesh_, o);
     for (int f = 0; f < FACES; ++f)
       for (int a = 0; a < DIM && mesh_->shape().sides[at(f)] == amr::Side::wall; ++a)
@@ -531,7 +538,7 @@ void Flow::solve(double elapsed) {
     for (int a = 0; a < DIM; ++a) excess[a] = sigma * drift[a] - excess[a];
     shift(solver_->force(), excess, unheld_axes);
   }
-  extrapolate(elapsed);
+  if (options_.coupling == Coupling::coupled) extrapolate(elapsed);  // a projection starts from the old pressure
   result_ = solver_->solve(sigma);
   if (!result_.converged)
     throw NumericalError(fmt::format("the flow did not converge: error {:.2e} of {:.0e} asked for after {} iterations",

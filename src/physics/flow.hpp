@@ -44,6 +44,9 @@ struct FlowOptions {
   double solid_density_ratio = 2.7 / 2.45;
   bool solutal_buoyancy = true, solid_weight = true, inertia = true;
   Buoyancy buoyancy = Buoyancy::mixture;
+  Coupling coupling = Coupling::coupled;
+  int projections = 1;
+  bool rotational = true;
   double tolerance = 1e-5;
   int max_iterations = 300;
   double courant = 0.5, max_interval_tau0 = 4, max_change = 0.05;

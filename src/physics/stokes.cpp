@@ -74,14 +74,6 @@ StokesSolver::StokesSolver(const amr::Mesh& mesh, const StokesOptions& options)
   };
 }
 
-template <class F>
-void StokesSolver::for_leaves(F&& f) const {
-  amr::parallel_for(mesh_.size(), [&](int b) {
-    const auto [g, i] = hierarchy_.place_of_block(b);
-    f(b, g, i, hierarchy_.grid(g).dx);
-  });
-}
-
 std::vector<amr::Links> StokesSolver::velocity_links(double sigma) const {
   std::vector<amr::Links> links(DIM);
   for (int a = 0; a < DIM; ++a) {
@@ -373,28 +365,18 @@ void StokesSolver::remove_mean_pressure(HierarchyField& f) const {
   });
 }
 
-// In place: pressure from the divergence, then velocities from what the pressure leaves of the momentum.
-void StokesSolver::precondition(HierarchyField& r) {
-  const IntVec whole = filled(mesh_.layout().n + 1);
-  const bool cycle = sigma_ > 0 || drag_ != nullptr;
-  const double factor = drag_ != nullptr ? 1.0 : sigma_;  // of -div grad, or it is in the mobility
-  if (cycle) {
-    remove_mean_pressure(r);
-    for_leaves([&](int, int g, int i, double) {
-      amr::copy_box(pressure_cycle_->rhs().ref(g, i, 0), {}, std::as_const(r).ref(g, i, PRESSURE), {}, filled(mesh_.layout().n));
-    });
-    pressure_cycle_->cycle();
-  }
+// pressure_cycle_'s solution for the pressures of r.
+void StokesSolver::cycle_pressure(HierarchyField& r) {
+  remove_mean_pressure(r);
   for_leaves([&](int, int g, int i, double) {
-    const Layout& layout = hierarchy_.grid(g).layout;
-    const double *nu = viscosity_.at(g, i, 0), *lap = pressure_cycle_->solution().at(g, i, 0), *d = r.at(g, i, PRESSURE);
-    double* p = pressure_.at(g, i, 0);
-    amr::for_each_cell({}, filled(layout.n), [&](const IntVec& q) {
-      const std::ptrdiff_t o = layout.offset(q);
-      p[o] = nu[o] * d[o] + (cycle ? factor * lap[o] : 0.0);
-    });
+    amr::copy_box(pressure_cycle_->rhs().ref(g, i, 0), {}, std::as_const(r).ref(g, i, PRESSURE), {}, filled(mesh_.layout().n));
   });
-  hierarchy_.make_composite(pressure_, 1, true);
+  pressure_cycle_->cycle();
+}
+
+// Velocities of r = one cycle for r - grad of pressure_, whose ghosts are filled.
+void StokesSolver::cycle_velocity(HierarchyField& r) {
+  const IntVec whole = filled(mesh_.layout().n + 1);
   for_leaves([&](int, int g, int i, double dx) {
     const Layout& layout = hierarchy_.grid(g).layout;
     const double* p = pressure_.at(g, i, 0);
@@ -414,9 +396,45 @@ void StokesSolver::precondition(HierarchyField& r) {
   for_leaves([&](int, int g, int i, double) {
     for (int a = 0; a < DIM; ++a)
       amr::copy_box(r.ref(g, i, a), {}, std::as_const(velocity_cycle_->solution()).ref(g, i, a), {}, whole);
+  });
+}
+
+// In place: pressure from the divergence, then velocities from what the pressure leaves of the momentum.
+void StokesSolver::precondition(HierarchyField& r) {
+  const bool cycle = sigma_ > 0 || drag_ != nullptr;
+  const double factor = drag_ != nullptr ? 1.0 : sigma_;  // of -div grad, or it is in the mobility
+  if (cycle) cycle_pressure(r);
+  for_leaves([&](int, int g, int i, double) {
+    const Layout& layout = hierarchy_.grid(g).layout;
+    const double *nu = viscosity_.at(g, i, 0), *lap = pressure_cycle_->solution().at(g, i, 0), *d = r.at(g, i, PRESSURE);
+    double* p = pressure_.at(g, i, 0);
+    amr::for_each_cell({}, filled(layout.n), [&](const IntVec& q) {
+      const std::ptrdiff_t o = layout.offset(q);
+      p[o] = nu[o] * d[o] + (cycle ? factor * lap[o] : 0.0);
+    });
+  });
+  hierarchy_.make_composite(pressure_, 1, true);
+  cycle_velocity(r);
+  for_leaves([&](int, int g, int i, double) {
     amr::copy_box(r.ref(g, i, PRESSURE), {}, std::as_const(pressure_).ref(g, i, 0), {}, filled(mesh_.layout().n));
   });
   remove_mean_pressure(r);
+}
+
+// The norm of the velocity alone: what the error of the solution is measured against.
+double StokesSolver::speed(const Vector& x) const {
+  Vector v = x;
+  blank(v, true);
+  return pieces_.norm(v);
+}
+
+// Sets the pressures, or the velocities, to 0.
+void StokesSolver::blank(Vector& v, bool pressures) const {
+  const std::ptrdiff_t cells = volume(filled(mesh_.layout().n));
+  for (int b = 0; b < mesh_.size(); ++b) {
+    double *first = v.data() + pieces_.first[at(b)], *last = v.data() + pieces_.first[at(b) + 1];
+    std::fill(pressures ? last - cells : first, pressures ? last : last - cells, 0.0);
+  }
 }
 
 StokesResult StokesSolver::solve(double sigma) {
@@ -425,27 +443,28 @@ StokesResult StokesSolver::solve(double sigma) {
   if (drag_ != nullptr) prepare_pressure();
   Vector x;
   pack(state_, x);
-  // The norm of the velocity alone: what the error of the solution is measured against.
-  Vector v_only(x.size());
-  const auto speed = [&](const Vector& now) {
-    std::copy(now.begin(), now.end(), v_only.begin());
-    for (int b = 0; b < mesh_.size(); ++b) {
-      const std::ptrdiff_t cells = volume(filled(mesh_.layout().n));
-      std::fill_n(v_only.begin() + (pieces_.first[at(b) + 1] - cells), cells, 0.0);
-    }
-    return pieces_.norm(v_only);
-  };
+  if (options_.coupling == Coupling::projection) {
+    StokesResult result = project(x);
+    finish(x, result);
+    return result;
+  }
   amr::GmresOptions o;
   o.max_iterations = options_.max_iterations;
   o.tolerance = options_.tolerance;
-  const amr::GmresResult g = gmres_.solve(x, pieces_, o, speed);
-  unpack(x, state_);
-  fill_state();
+  const amr::GmresResult g = gmres_.solve(x, pieces_, o, [this](const Vector& now) { return speed(now); });
   StokesResult result;
   result.iterations = g.iterations;
   result.converged = g.converged;
+  result.error = g.residual;
+  finish(x, result);
+  return result;
+}
+
+void StokesSolver::finish(const Vector& x, StokesResult& result) {
+  unpack(x, state_);
+  fill_state();
   const double scale = speed(x);
-  result.error = scale > 0 ? g.residual / scale : g.residual;
+  if (scale > 0) result.error /= scale;
   double div = 0, fastest = 0;
   for (int b = 0; b < mesh_.size(); ++b) {
     const auto [gr, i] = hierarchy_.place_of_block(b);
@@ -463,7 +482,6 @@ StokesResult StokesSolver::solve(double sigma) {
   div = amr::global_max(div, mesh_.comm());
   fastest = amr::global_max(fastest, mesh_.comm());
   result.divergence_max = fastest > 0 ? div / fastest : div;
-  return result;
 }
 
 }  // namespace dendrift::physics

@@ -18,8 +18,15 @@ namespace dendrift::physics {
 
 enum class Stress : std::uint8_t { symmetric, laplacian };
 
+/// coupled: velocity and pressure together. projection: the velocity with the old pressure, then the pressure that takes
+/// its divergence away (incremental pressure correction); cheap, and wrong by the splitting.
+enum class Coupling : std::uint8_t { coupled, projection };
+
 struct StokesOptions {
   Stress stress = Stress::symmetric;
+  Coupling coupling = Coupling::coupled;
+  int passes = 1;          ///< of the projection
+  bool rotational = true;  ///< its pressure takes -nu div v as well (Timmermans, Minev & van de Vosse, 1996)
   double tolerance = 1e-6;  ///< preconditioned residual over the norm of the velocity
   int max_iterations = 300;
 };
@@ -27,7 +34,7 @@ struct StokesOptions {
 struct StokesResult {
   int iterations = 0;
   bool converged = false;
-  double error = 0;           ///< preconditioned residual over the norm of the velocity
+  double error = 0;           ///< preconditioned residual over the norm of the velocity: of the coupled system, always
   double divergence_max = 0;  ///< largest |div v| dx over the largest |v|
 };
 
@@ -67,10 +74,23 @@ class StokesSolver {
   void prepare_pressure();
   void apply(const amr::HierarchyField& x, const amr::HierarchyField* rhs, amr::HierarchyField& y);
   void precondition(amr::HierarchyField& r);
+  void cycle_pressure(amr::HierarchyField& r);
+  void cycle_velocity(amr::HierarchyField& r);
+  StokesResult project(Vector& x);
+  void project_pass(Vector& x, StokesResult& result);
+  void subtract_gradient(const amr::HierarchyField& p, double factor, amr::HierarchyField& v) const;
+  void finish(const Vector& x, StokesResult& result);
+  double speed(const Vector& x) const;
+  void blank(Vector& v, bool pressures) const;
   void pack(const amr::HierarchyField& f, Vector& v) const;
   void unpack(const Vector& v, amr::HierarchyField& f) const;
   template <class F>
-  void for_leaves(F&& f) const;
+  void for_leaves(F&& f) const {
+    amr::parallel_for(mesh_.size(), [&](int b) {
+      const auto [g, i] = hierarchy_.place_of_block(b);
+      f(b, g, i, hierarchy_.grid(g).dx);
+    });
+  }
   void remove_mean_pressure(amr::HierarchyField& f) const;
 
   StokesOptions options_;
@@ -82,7 +102,7 @@ class StokesSolver {
   RigidBodies bodies_;
   std::unique_ptr<amr::Multigrid> velocity_cycle_, pressure_cycle_;
   amr::Pieces pieces_;
-  amr::Gmres gmres_;
+  amr::Gmres gmres_, momentum_, poisson_;
   double sigma_ = 0, largest_drag_ = 0;
   bool closed_ = true;  // pressure known up to a constant
 };

@@ -1,0 +1,135 @@
+// Incremental pressure correction on the hierarchy: the cheap way of StokesSolver.
+#include <algorithm>
+#include <cmath>
+
+#include "physics/stokes.hpp"
+
+namespace dendrift::physics {
+
+using amr::HierarchyField;
+using amr::Layout;
+using amr::Range;
+
+namespace {
+std::size_t at(int i) { return static_cast<std::size_t>(i); }
+}  // namespace
+
+// v -= factor * grad p on the unknown faces of the leaves. Ghosts of p are filled.
+void StokesSolver::subtract_gradient(const HierarchyField& p, double factor, HierarchyField& v) const {
+  for_leaves([&](int, int g, int i, double dx) {
+    const Layout& layout = hierarchy_.grid(g).layout;
+    const double* from = p.at(g, i, 0);
+    for (int a = 0; a < DIM; ++a) {
+      double* to = v.at(g, i, a);
+      const Range r = hierarchy_.unknowns(g, i, components_[at(a)], true);
+      amr::for_each_cell(r.lo, r.size, [&](const IntVec& q) {
+        const std::ptrdiff_t o = layout.offset(q);
+        to[o] -= factor / dx * (from[o] - from[o - layout.stride(a)]);
+      });
+    }
+  });
+}
+
+StokesResult StokesSolver::project(Vector& x) {
+  momentum_.residual = [this](const Vector& now, Vector& r) {
+    gmres_.residual(now, r);
+    blank(r, true);
+  };
+  momentum_.apply = [this](const Vector& v, Vector& w) {
+    gmres_.apply(v, w);
+    blank(w, true);
+  };
+  momentum_.precondition = [this](Vector& r) {
+    unpack(r, image_);
+    for_leaves([&](int, int g, int i, double) {
+      std::fill_n(pressure_.at(g, i, 0) - mesh_.layout().interior(), mesh_.layout().size(), 0.0);
+    });
+    cycle_velocity(image_);
+    pack(image_, r);
+    blank(r, true);
+  };
+  // -div grad phi = -sigma div v, the gradient put together over the levels before its divergence is taken.
+  poisson_.apply = [this](const Vector& v, Vector& w) {
+    unpack(v, work_);
+    for_leaves([&](int, int g, int i, double) {
+      amr::copy_box(pressure_.ref(g, i, 0), {}, std::as_const(work_).ref(g, i, PRESSURE), {}, filled(mesh_.layout().n));
+      for (int a = 0; a < DIM; ++a) std::fill_n(work_.at(g, i, a) - mesh_.layout().interior(), mesh_.layout().size(), 0.0);
+    });
+    hierarchy_.make_composite(pressure_, 1, true);
+    subtract_gradient(pressure_, 1, work_);
+    hierarchy_.make_composite(work_, 1, true);
+    apply(work_, nullptr, image_);
+    pack(image_, w);
+    blank(w, false);
+  };
+  poisson_.precondition = [this](Vector& r) {
+    unpack(r, image_);
+    cycle_pressure(image_);
+    for_leaves([&](int, int g, int i, double) {
+      amr::copy_box(image_.ref(g, i, PRESSURE), {}, std::as_const(pressure_cycle_->solution()).ref(g, i, 0), {},
+                    filled(mesh_.layout().n));
+    });
+    remove_mean_pressure(image_);
+    pack(image_, r);
+    blank(r, false);
+  };
+  StokesResult result;
+  result.converged = true;
+  for (int pass = 0; pass < options_.passes; ++pass) project_pass(x, result);
+  Vector r;
+  gmres_.residual(x, r);
+  gmres_.precondition(r);
+  result.error = pieces_.norm(r);
+  return result;
+}
+
+void StokesSolver::project_pass(Vector& x, StokesResult& result) {
+  amr::GmresOptions o;
+  o.max_iterations = options_.max_iterations;
+  o.tolerance = options_.tolerance;
+  const amr::GmresResult m = momentum_.solve(x, pieces_, o, [this](const Vector& now) { return speed(now); });
+
+  unpack(x, state_);
+  hierarchy_.make_composite(state_, 1, false);
+  apply(state_, nullptr, image_);
+  Vector divergence;
+  pack(image_, divergence);
+  blank(divergence, false);
+
+  amr::Pieces plain = pieces_;  // pressures by volume, not by the viscosity
+  for (int b = 0; b < mesh_.size(); ++b) {
+    const std::ptrdiff_t cells = volume(filled(mesh_.layout().n));
+    const double cell = std::pow(mesh_.block(b).dx / hierarchy_.grid(0).dx, DIM);
+    std::fill_n(plain.weight.begin() + (pieces_.first[at(b) + 1] - cells), cells, cell);
+  }
+  Vector phi(x.size(), 0.0);
+  poisson_.residual = [&](const Vector& now, Vector& r) {
+    r.resize(now.size());
+    poisson_.apply(now, r);
+    for (std::size_t q = 0; q < r.size(); ++q) r[q] = -sigma_ * divergence[q] - r[q];
+  };
+  const amr::GmresResult p = poisson_.solve(phi, plain, o, [&](const Vector& now) { return plain.norm(now); });
+  result.iterations += m.iterations + p.iterations;
+  result.converged = result.converged && m.converged && p.converged;
+
+  unpack(phi, work_);
+  unpack(divergence, image_);
+  for_leaves([&](int, int g, int i, double) {
+    amr::copy_box(pressure_.ref(g, i, 0), {}, std::as_const(work_).ref(g, i, PRESSURE), {}, filled(mesh_.layout().n));
+  });
+  hierarchy_.make_composite(pressure_, 1, true);
+  unpack(x, state_);
+  subtract_gradient(pressure_, 1 / sigma_, state_);
+  for_leaves([&](int, int g, int i, double) {
+    const Layout& layout = hierarchy_.grid(g).layout;
+    const double *nu = viscosity_.at(g, i, 0), *d = image_.at(g, i, PRESSURE), *change = pressure_.at(g, i, 0);
+    double* to = state_.at(g, i, PRESSURE);
+    amr::for_each_cell({}, filled(layout.n), [&](const IntVec& q) {
+      const std::ptrdiff_t c = layout.offset(q);
+      to[c] += change[c] - (options_.rotational ? nu[c] * d[c] : 0.0);
+    });
+  });
+  pack(state_, x);
+}
+
+}  // namespace dendrift::physics
