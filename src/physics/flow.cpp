@@ -59,7 +59,7 @@ void FlowOptions::declare(io::Schema& schema) {
   t.boolean("inertia", inertia).doc("v.grad v in the momentum equation");
   t.choice("buoyancy", buoyancy, {{"mixture", Buoyancy::mixture}, {"liquid", Buoyancy::liquid}})
       .doc("excess of solute inside the interface: c as it is (the print), or of liquid of the same U");
-  t.real("tolerance", tolerance).range(1e-12, 0.1).doc("relative error of the velocity in one solution");
+  t.real("tolerance", tolerance).range(1e-12, 0.1).doc("preconditioned residual of a solution over the norm of the velocity; crystals err by some 30 times as much");
   t.integer("max_iterations", max_iterations).at_least(1).doc("of a solution; more is a numerical failure");
   t.real("courant", courant).range(0.01, 10).doc("cells that the melt moves between two solutions at most");
   t.real("max_interval_tau0", max_interval_tau0).unit("tau0").above(0).doc("time between two solutions at most");
@@ -253,6 +253,16 @@ void Flow::declare(amr::FieldTable& fields) {
   p.transfer = amr::Transfer::conservative;
   p.checkpoint = true;
   pressure_ = fields.add_cell(p);
+  v.name = "velocity_rate";
+  v.symbol = "dv/dt";
+  v.unit = "W0/tau0^2";
+  v.doc = "change of the velocity in the last step of the flow: where the next one starts its search";
+  v_rate_ = fields.add_face(v);
+  p.name = "pressure_rate";
+  p.symbol = "dp/dt";
+  p.unit = "W0^2/tau0^3";
+  p.doc = "the same of the pressure";
+  pressure_rate_ = fields.add_cell(p);
 }
 
 void Flow::attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) {
@@ -298,7 +308,7 @@ void Flow::after_regrid() {
   // them.
   load();
   solver_->fill_state();
-  store();
+  store(0);
 }
 
 std::vector<double> Flow::memory() const { return {last_, next_, interval_, fastest_, due_ ? 1.0 : 0.0}; }
@@ -332,13 +342,34 @@ void Flow::load() {
   });
 }
 
-void Flow::store() {
+// Keeps the solution, and how fast it has changed since the last one.
+void Flow::store(double elapsed) {
   const amr::HierarchyField& state = solver_->state();
+  const std::ptrdiff_t origin = mesh_->layout().interior(), size = mesh_->layout().size();
   amr::parallel_for(mesh_->size(), [&](int b) {
     const auto [g, i] = solver_->hierarchy().place_of_block(b);
-    const std::ptrdiff_t origin = mesh_->layout().interior(), size = mesh_->layout().size();
-    for (int a = 0; a < DIM; ++a) std::copy_n(state.at(g, i, a) - origin, size, mesh_->faces(v_, a, b) - origin);
-    std::copy_n(state.at(g, i, StokesSolver::PRESSURE) - origin, size, mesh_->cells(pressure_, b) - origin);
+    const auto keep = [&](const double* now, double* old, double* rate) {
+      for (std::ptrdiff_t q = -origin; q < size - origin; ++q) {
+        if (elapsed > 0) rate[q] = (now[q] - old[q]) / elapsed;
+        old[q] = now[q];
+      }
+    };
+    for (int a = 0; a < DIM; ++a) keep(state.at(g, i, a), mesh_->faces(v_, a, b), mesh_->faces(v_rate_, a, b));
+    keep(state.at(g, i, StokesSolver::PRESSURE), mesh_->cells(pressure_, b), mesh_->cells(pressure_rate_, b));
+  });
+}
+
+// The first guess: what the last change would lead to if it went on.
+void Flow::extrapolate(double elapsed) {
+  amr::HierarchyField& state = solver_->state();
+  const std::ptrdiff_t origin = mesh_->layout().interior(), size = mesh_->layout().size();
+  amr::parallel_for(mesh_->size(), [&](int b) {
+    const auto [g, i] = solver_->hierarchy().place_of_block(b);
+    const auto advance = [&](double* x, const double* rate) {
+      for (std::ptrdiff_t q = -origin; q < size - origin; ++q) x[q] += elapsed * rate[q];
+    };
+    for (int a = 0; a < DIM; ++a) advance(state.at(g, i, a), mesh_->faces(v_rate_, a, b));
+    advance(state.at(g, i, StokesSolver::PRESSURE), mesh_->cells(pressure_rate_, b));
   });
 }
 
@@ -482,14 +513,7 @@ void Flow::solve(double elapsed) {
     for (int a = 0; a < DIM; ++a) excess[a] = sigma * drift[a] - excess[a];
     shift(solver_->force(), excess, unheld_axes);
   }
-  before_.clear();
-  for (int b = 0; b < mesh_->size(); ++b) {
-    const auto [g, i] = solver_->hierarchy().place_of_block(b);
-    for (int a = 0; a < DIM; ++a)
-      amr::for_each_cell({}, filled(mesh_->layout().n), [&](const IntVec& q) {
-        before_.push_back(solver_->state().at(g, i, a)[mesh_->layout().offset(q)]);
-      });
-  }
+  extrapolate(elapsed);
   result_ = solver_->solve(sigma);
   if (!result_.converged)
     throw NumericalError(fmt::format("the flow did not converge: error {:.2e} of {:.0e} asked for after {} iterations",
@@ -499,20 +523,19 @@ void Flow::solve(double elapsed) {
     for (int a = 0; a < DIM; ++a) drift[a] -= now[a];
     shift(solver_->state(), drift, unheld_axes);
   }
-  store();
   double change = 0, fastest = 0;
-  std::size_t k = 0;
   for (int b = 0; b < mesh_->size(); ++b) {
     const auto [g, i] = solver_->hierarchy().place_of_block(b);
     for (int a = 0; a < DIM; ++a)
       amr::for_each_cell({}, filled(mesh_->layout().n), [&](const IntVec& q) {
         const double v = solver_->state().at(g, i, a)[mesh_->layout().offset(q)];
-        change = std::max(change, std::abs(v - before_[k++]));
+        change = std::max(change, std::abs(v - mesh_->faces(v_, a, b)[mesh_->layout().offset(q)]));
         fastest = std::max(fastest, std::abs(v));
       });
   }
   change = amr::global_max(change, mesh_->comm());
   fastest_ = amr::global_max(fastest, mesh_->comm());
+  store(elapsed);
   // The interval after which the velocity will have changed as much as wanted, at the rate seen now.
   const double wanted = change > 0 ? elapsed * options_.max_change * fastest_ / change : options_.max_interval_tau0;
   const double dx = mesh_->shape().dx(mesh_->shape().max_level);

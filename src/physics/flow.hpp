@@ -37,7 +37,7 @@ struct FlowOptions {
   double solid_density_ratio = 2.7 / 2.45;
   bool solutal_buoyancy = true, solid_weight = true, inertia = true;
   Buoyancy buoyancy = Buoyancy::mixture;
-  double tolerance = 1e-6;
+  double tolerance = 1e-5;
   int max_iterations = 300;
   double courant = 0.5, max_interval_tau0 = 4, max_change = 0.05;
   std::array<std::optional<RealVec>, 6> wall_velocity_w0_tau0;  ///< those of z are read in 3D only
@@ -102,7 +102,8 @@ class Flow : public Module {
  private:
   void solve(double elapsed);
   void load();
-  void store();
+  void store(double elapsed);
+  void extrapolate(double elapsed);
   void set_viscosity();
   void set_force(double sigma);
   void add_inertia(int b);
@@ -115,13 +116,12 @@ class Flow : public Module {
   std::vector<Seed>& crystals_;
   double solutal_, weight_;  // alpha_c c_l and rho_s/rho_l - 1, times the switches
   RealVec gravity_{};  // W0/tau0^2
-  amr::CellField psi_, c_, pressure_;
-  amr::FaceField v_;
+  amr::CellField psi_, c_, pressure_, pressure_rate_;
+  amr::FaceField v_, v_rate_;
   amr::Mesh* mesh_ = nullptr;
   amr::GhostExchange* ghosts_ = nullptr;
   std::unique_ptr<StokesSolver> solver_;
   std::vector<amr::BlockIndex> leaves_;  // of the tree that the velocity belongs to
-  std::vector<double> before_;  // velocity before a solution, to see how fast it changes
   double last_ = 0, next_ = 0, interval_ = 0;
   double fastest_ = 0;
   bool due_ = false, recalled_ = false;

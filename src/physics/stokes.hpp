@@ -19,7 +19,7 @@ enum class Stress : std::uint8_t { symmetric, laplacian };
 
 struct StokesOptions {
   Stress stress = Stress::symmetric;
-  double tolerance = 1e-6;  ///< preconditioned residual over the norm of the velocity; thin arms err by some 50 times as much
+  double tolerance = 1e-6;  ///< preconditioned residual over the norm of the velocity
   int max_iterations = 300;
 };
 
