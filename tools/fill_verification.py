@@ -72,7 +72,8 @@ def falling_disc(r):
 
 
 def cavity(r):
-    return [r["Re"], r["cells"], *(num(r[f"{a}_{b}_difference"], 4) for a in "uv" for b in ("largest", "rms"))]
+    return [r["Re"], r["cells"], *(num(r[f"{a}_{b}_difference"], 4) for a in "uv" for b in ("largest", "rms")),
+            *(num(r[k], 4) for k in ("u_min", "v_max", "v_min"))]
 
 
 def taylor_green(r):

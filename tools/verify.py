@@ -561,6 +561,12 @@ def cavity():
                 reference = at_100 if re == 100 else at_1000
                 off.append(float(value) - reference)
                 lines.append({"Re": re, "cells": cells, "line": name, "place": place, "velocity": float(value), "reference": reference})
+            for kind, best in (("min", np.argmin), ("max", np.argmax)):  # of a parabola through three cells
+                if name == "u" and kind == "max":
+                    continue  # at the lid
+                i = int(np.clip(best(line), 1, cells - 2))
+                a, b, c = (float(v) for v in line[i - 1 : i + 2])
+                row[f"{name}_{kind}"] = b - (c - a) ** 2 / (8 * (a - 2 * b + c))
             row |= {f"{name}_largest_difference": max(off, key=abs), f"{name}_rms_difference": float(np.sqrt(np.mean(np.square(off))))}
         rows.append(row | r.cost())
     write("cavity_lines", lines)
