@@ -391,7 +391,7 @@ void Simulation::open_output() {
       if (error) throw io::OutputError(settings_.output.dir, "create the folder", error.message());
       const std::string diagnostics =
           "step,time_s,time_tau0,dt_tau0,blocks,cells,levels,solid_fraction,solute_mean_wt,solute_drift_rel,"
-          "max_speed_um_s,div_max_rel,flow_iterations,wall_s";
+          "max_speed_um_s,div_max_rel,flow_iterations,wall_s,flow_residual";
       const std::string tips = std::string("time_s,grain,arm,euler_deg,x_um,y_um,") + (DIM == 3 ? "z_um," : "") +
                                "speed_um_s,radius_um,off_axis_deg";
       const std::string grains =
@@ -434,7 +434,7 @@ void Simulation::write_line(const Totals& t, double dt) {
                           static_cast<double>(t.blocks * volume(filled(mesh_->layout().n))),
                           static_cast<double>(t.levels), t.solid_fraction, t.solute_mean * s.c_l_wt, solute_drift(t),
                           s.speed_um_s(r.max_speed), r.divergence_max, static_cast<double>(r.flow_iterations),
-                          MPI_Wtime() - wall_start_});
+                          MPI_Wtime() - wall_start_, r.flow_residual});
 }
 
 void Simulation::write_tips(io::SharedFailure& failure) {

@@ -522,6 +522,24 @@ void Flow::shift(amr::HierarchyField& f, const RealVec& by, const Array<bool>& a
   });
 }
 
+// The true residual, in the one norm that tells how wrong a crystal's speed is: the drag that a disc (2D, without the
+// logarithm) or a sphere would have at the largest speed. Free crystals only.
+double Flow::unbalanced() const {
+  if (options_.motion == Motion::held || !(fastest_ > 0)) return 0;
+  const std::vector<RealVec> forces = net_forces(*mesh_, psi_, crystals_, [&](int b, int axis) {
+    const auto [g, i] = solver_->hierarchy().place_of_block(b);
+    return solver_->residual().at(g, i, axis);
+  });
+  double most = 0;
+  for (std::size_t g = 0; g < crystals_.size(); ++g) {
+    double square = 0;
+    for (const double f : forces[g]) square += f * f;
+    const double drag = DIM == 2 ? 4 * std::numbers::pi : 6 * std::numbers::pi * std::cbrt(0.75 / std::numbers::pi * crystals_[g].volume);
+    if (drag > 0) most = std::max(most, std::sqrt(square) / (drag * scales_.viscosity * fastest_));
+  }
+  return most;
+}
+
 void Flow::solve(double elapsed) {
   ghosts_->fill({psi_, c_});
   load();
@@ -560,6 +578,7 @@ void Flow::solve(double elapsed) {
   }
   change = amr::global_max(change, mesh_->comm());
   fastest_ = amr::global_max(fastest, mesh_->comm());
+  unbalanced_ = unbalanced();
   store(elapsed);
   // The interval after which the velocity will have changed as much as wanted, at the rate seen now.
   const double wanted = change > 0 ? elapsed * options_.max_change * fastest_ / change : options_.max_interval_tau0;
@@ -584,6 +603,7 @@ void Flow::report(Report& r) const {
   r.max_speed = fastest_;
   r.divergence_max = result_.divergence_max;
   r.flow_iterations = result_.iterations;
+  r.flow_residual = unbalanced_;
 }
 
 }  // namespace dendrift::physics

@@ -122,6 +122,7 @@ class Flow : public Module {
   bool penalised() const { return options_.solid == SolidModel::penalised || options_.motion == Motion::held; }
   void set_force(double sigma);
   void add_inertia(int b);
+  double unbalanced() const;
   Array<bool> unheld() const;
   RealVec means(const amr::HierarchyField& f) const;
   void shift(amr::HierarchyField& f, const RealVec& by, const Array<bool>& axes);
@@ -138,7 +139,7 @@ class Flow : public Module {
   std::unique_ptr<StokesSolver> solver_;
   std::vector<amr::BlockIndex> leaves_;  // of the tree that the velocity belongs to
   double last_ = 0, next_ = 0, interval_ = 0;
-  double fastest_ = 0;
+  double fastest_ = 0, unbalanced_ = 0;
   bool due_ = false, recalled_ = false;
   StokesResult result_;
 };

@@ -23,6 +23,7 @@ struct Report {
   double max_speed = 0;       ///< W0/tau0
   double divergence_max = 0;  ///< largest |div v| dx over the largest |v|
   int flow_iterations = 0;
+  double flow_residual = 0;   ///< largest force on a crystal that is left unbalanced, over its drag at the largest speed
 };
 
 /// The defaults do nothing. Times in tau0, lengths in W0.

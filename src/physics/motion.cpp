@@ -77,7 +77,7 @@ class Solid {
     return amr::exact_sums(total, mesh_.comm());
   }
 
- private:
+  /// Sets the crystal whose centre is nearest to x, and the way from there.
   void find_crystal(const RealVec& x, Sample& s) const {
     const RealVec lo = mesh_.shape().lo, hi = mesh_.shape().hi();
     const Array<bool> periodic = mesh_.shape().periodic();
@@ -97,6 +97,7 @@ class Solid {
     }
   }
 
+ private:
   const amr::Mesh& mesh_;
   amr::CellField psi_;
   amr::FaceField velocity_;
@@ -113,6 +114,39 @@ Vector3 spin_of(const Vector3& l, const double* inertia) {
 }
 
 }  // namespace
+
+std::vector<RealVec> net_forces(const amr::Mesh& mesh, amr::CellField psi, const std::vector<Seed>& crystals,
+                                const std::function<const double*(int b, int axis)>& force) {
+  const amr::Layout& layout = mesh.layout();
+  const Solid solid(mesh, psi, {}, crystals);
+  std::vector<std::vector<double>> parts(at(mesh.size()));
+  amr::parallel_for(mesh.size(), [&](int b) {
+    const amr::Block& block = mesh.block(b);
+    const double* phase = mesh.cells(psi, b);
+    const double half = 0.5 * std::pow(block.dx, DIM);  // each face is met from both of its cells
+    amr::for_each_cell({}, filled(layout.n), [&](const IntVec& q) {
+      constexpr double MELT = -0.99;
+      const std::ptrdiff_t o = layout.offset(q);
+      if (phi_of_psi(phase[o]) < MELT) return;
+      RealVec x{};
+      for (int a = 0; a < DIM; ++a) x[a] = block.lo[a] + (q[a] + 0.5) * block.dx;
+      Sample s{};
+      solid.find_crystal(x, s);
+      parts[at(b)].resize(DIM * crystals.size());
+      for (int a = 0; a < DIM; ++a) {
+        const double* f = force(b, a) + o;
+        parts[at(b)][s.crystal * DIM + at(a)] += half * (f[0] + f[layout.stride(a)]);
+      }
+    });
+  });
+  std::vector<amr::ExactSum> total(DIM * crystals.size());
+  for (const std::vector<double>& part : parts)
+    for (std::size_t k = 0; k < part.size(); ++k) total[k].add(part[k]);
+  const std::vector<double> sums = amr::exact_sums(total, mesh.comm());
+  std::vector<RealVec> net(crystals.size());
+  for (std::size_t g = 0; g < crystals.size(); ++g) std::copy_n(sums.data() + g * DIM, DIM, net[g].begin());
+  return net;
+}
 
 void measure_motion(const amr::Mesh& mesh, amr::CellField psi, amr::FaceField velocity, std::vector<Seed>& crystals) {
   if (crystals.empty()) return;

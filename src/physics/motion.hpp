@@ -2,6 +2,7 @@
 /// How the crystals move: read off the velocity inside them, never integrated over their surfaces.
 #pragma once
 
+#include <functional>
 #include <vector>
 
 #include "amr/mesh.hpp"
@@ -13,5 +14,10 @@ namespace dendrift::physics {
 /// (phi > .9) best, by least squares. Without a velocity (id -1) nothing moves. The solid nearest to a crystal's centre counts as its own. Collective; the same on all
 /// ranks and whatever their number.
 void measure_motion(const amr::Mesh& mesh, amr::CellField psi, amr::FaceField velocity, std::vector<Seed>& crystals);
+
+/// Net force on each crystal and the interface round it (phi > -.99), of a force per mass on faces: force(b, axis) points
+/// at cell (0,0[,0]) of local block b. Collective, the same on any ranks.
+std::vector<RealVec> net_forces(const amr::Mesh& mesh, amr::CellField psi, const std::vector<Seed>& crystals,
+                                const std::function<const double*(int b, int axis)>& force);
 
 }  // namespace dendrift::physics

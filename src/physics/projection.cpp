@@ -96,12 +96,7 @@ void StokesSolver::project_pass(Vector& x, StokesResult& result) {
   pack(image_, divergence);
   blank(divergence, false);
 
-  amr::Pieces plain = pieces_;  // pressures by volume, not by the viscosity
-  for (int b = 0; b < mesh_.size(); ++b) {
-    const std::ptrdiff_t cells = volume(filled(mesh_.layout().n));
-    const double cell = std::pow(mesh_.block(b).dx / hierarchy_.grid(0).dx, DIM);
-    std::fill_n(plain.weight.begin() + (pieces_.first[at(b) + 1] - cells), cells, cell);
-  }
+  const amr::Pieces plain = plain_pieces();
   Vector phi(x.size(), 0.0);
   poisson_.residual = [&](const Vector& now, Vector& r) {
     r.resize(now.size());

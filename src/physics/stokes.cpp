@@ -460,9 +460,21 @@ StokesResult StokesSolver::solve(double sigma) {
   return result;
 }
 
+// Products with pressures weighted by volume like velocities, not as the velocities that they stand for.
+amr::Pieces StokesSolver::plain_pieces() const {
+  amr::Pieces plain = pieces_;
+  for (int b = 0; b < mesh_.size(); ++b) {
+    const std::ptrdiff_t cells = volume(filled(mesh_.layout().n));
+    const double cell = std::pow(mesh_.block(b).dx / hierarchy_.grid(0).dx, DIM);
+    std::fill_n(plain.weight.begin() + (pieces_.first[at(b) + 1] - cells), cells, cell);
+  }
+  return plain;
+}
+
 void StokesSolver::finish(const Vector& x, StokesResult& result) {
   unpack(x, state_);
   fill_state();
+  apply(state_, &force_, image_);
   const double scale = speed(x);
   if (scale > 0) result.error /= scale;
   double div = 0, fastest = 0;

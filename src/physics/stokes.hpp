@@ -64,6 +64,9 @@ class StokesSolver {
                 const std::vector<RealVec>& centres);
 
   StokesResult solve(double sigma);
+  /// What the last solution leaves of the momentum equation, on the unknown faces of the leaves. Faces that finer leaves
+  /// own, and those of walls, hold nothing of use.
+  const amr::HierarchyField& residual() const { return image_; }
   /// Fills parents and ghosts of state(). Collective.
   void fill_state() { hierarchy_.make_composite(state_, amr::Layout::GHOSTS, false); }
 
@@ -82,6 +85,7 @@ class StokesSolver {
   void finish(const Vector& x, StokesResult& result);
   double speed(const Vector& x) const;
   void blank(Vector& v, bool pressures) const;
+  amr::Pieces plain_pieces() const;
   void pack(const amr::HierarchyField& f, Vector& v) const;
   void unpack(const Vector& v, amr::HierarchyField& f) const;
   template <class F>
