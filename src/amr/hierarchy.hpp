@@ -126,7 +126,6 @@ class Hierarchy {
     int grid, node;
   };
   Place place_of_block(int b) const { return places_[static_cast<std::size_t>(b)]; }
-  int block(int g, int i) const { return mesh_.local(grid(g).mine(i).leaf); }
 
   /// Unknowns of component c in local node i. `composite`: leave out what finer nodes own instead.
   Range unknowns(int g, int i, const Component& c, bool composite) const;

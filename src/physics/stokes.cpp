@@ -114,7 +114,12 @@ void StokesSolver::set_viscosity(const std::function<void(int, double*)>& phase,
   // Coarser grids: the square of the mean of square roots. Iterations from rest to 1e-5, ratio 1e6, for a disc (R = 80),
   // a cross (half width 10) and a seed (R = 10) in a wide box: this one 22, 20, 20; arithmetic means 22, 19, 26;
   // geometric ones bend solids (27, 36 at 1e-4 already).
-  const HierarchyField exact = viscosity_;
+  const auto copy_cells = [&](const HierarchyField& from, HierarchyField& to) {
+    for_leaves([&](int, int g, int i, double) {
+      amr::copy_box(to.ref(g, i, 0), {}, from.ref(g, i, 0), {}, filled(mesh_.layout().n));
+    });
+  };
+  copy_cells(viscosity_, pressure_);
   const auto with_cells = [&](int g, auto&& change) {
     amr::parallel_for(hierarchy_.grid(g).size(), [&](int i) {
       double* nu = viscosity_.at(g, i, 0);
@@ -131,9 +136,7 @@ void StokesSolver::set_viscosity(const std::function<void(int, double*)>& phase,
     with_cells(g, square);
   }
   with_cells(hierarchy_.grids() - 1, square);
-  for_leaves([&](int, int g, int i, double) {  // without the round-off of these
-    amr::copy_box(viscosity_.ref(g, i, 0), {}, exact.ref(g, i, 0), {}, filled(mesh_.layout().n));
-  });
+  copy_cells(pressure_, viscosity_);  // the leaves without the round-off of roots and squares
   for (int g = 0; g + 1 < hierarchy_.grids(); ++g) {
     const Grid& coarse = hierarchy_.grid(g + 1);
     const Layout& layout = coarse.layout;

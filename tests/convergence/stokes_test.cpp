@@ -121,6 +121,56 @@ TEST(Stokes, PenalisedDiscFallsLikeASharpOne) {
   EXPECT_LT(settle(uniform, disc, 1, physics::ViscosityLaw::h3, 0, Solid::held).core, 2e-3 * s.core);
 }
 
+// A free disc of radius a in the middle of a drum of radius R that a drag holds: F/(nu U) = 4 pi/[ln(R/a) -
+// (R^2-a^2)/(R^2+a^2)], and the torque 4 pi nu W a^2 R^2/(R^2-a^2), both for sharp surfaces.
+TEST(Stokes, DiscInADrum) {
+  constexpr double A = 16, R = 40, SIDE = 96;
+  amr::Mesh mesh = box(SIDE, 12, 16, 1, [](const amr::Block&) { return false; });
+  const Disc disc{A, filled_real(SIDE / 2)}, drum{R, filled_real(SIDE / 2)};
+  StokesOptions o;
+  o.tolerance = 1e-7;
+  StokesSolver solver(mesh, o);
+  const auto phase = [&](double sign, const Disc& d) {
+    return [&mesh, &d, sign](int b, double* phi) {
+      for_all(mesh.layout(), [&](const IntVec& q) { phi[mesh.layout().offset(q)] = sign * d.phi(place(mesh.block(b), q, -1)); });
+    };
+  };
+  solver.set_viscosity(phase(1, disc), [](double phi) { return physics::relative_viscosity(physics::ViscosityLaw::h3, 1e6, phi); });
+  solver.set_drag(phase(-1, drum), physics::relative_drag, {});
+  const auto solid = [&](const RealVec& x) { return 0.5 * (1 + disc.phi(x)); };
+  const auto turning = [&](int a, const RealVec& x) { return a == 0 ? -(x[1] - SIDE / 2) : x[0] - SIDE / 2; };
+  for (const bool torque : {false, true}) {
+    // A torque on the rigid part alone, a weight on all of the diffuse disc.
+    const auto force = [&](int a, const RealVec& x) {
+      if (torque) return disc.phi(x) > 0.9 ? turning(a, x) : 0.0;
+      return a == 1 ? solid(x) : 0.0;
+    };
+    set_force(solver, mesh, force);
+    ASSERT_TRUE(solver.solve(0).converged);
+    double load = 0, motion = 0, cells = 0;
+    for (int b = 0; b < mesh.size(); ++b) {
+      const auto [g, i] = solver.hierarchy().place_of_block(b);
+      const double dx = mesh.block(b).dx;
+      amr::for_each_cell({}, filled(16), [&](const IntVec& q) {
+        for (int a = 0; a < 2; ++a) {
+          const RealVec x = place(mesh.block(b), q, a);
+          load += dx * dx * force(a, x) * (torque ? turning(a, x) : a == 1 ? 1.0 : 0.0);
+        }
+        if (disc.phi(place(mesh.block(b), q, -1)) < 0.999) return;
+        const std::ptrdiff_t p = mesh.layout().offset(q);
+        const double *u = solver.state().at(g, i, 0) + p, *v = solver.state().at(g, i, 1) + p;
+        motion += torque ? 0.5 * ((v[0] - v[-1]) - (u[0] - u[-mesh.layout().stride(1)])) / dx : v[0];
+        ++cells;
+      });
+    }
+    motion /= cells;
+    const double sharp = torque ? 4 * M_PI * A * A * R * R / (R * R - A * A)
+                                : 4 * M_PI / (std::log(R / A) - (R * R - A * A) / (R * R + A * A));
+    EXPECT_NEAR(load / motion, sharp, 0.01 * sharp) << (torque ? "torque" : "force");
+    RecordProperty(torque ? "torque" : "force", std::to_string(load / motion / sharp - 1));
+  }
+}
+
 // Direct sparse solutions of the staggered problem: h3 at ratio 1e5, R = 10, closed box of 80, nu_l = 1.
 TEST(Stokes, DiffuseDiscFallsAtTheKnownSpeed) {
   amr::Mesh uniform = box(80, 5, 16, 1, [](const amr::Block&) { return false; });
