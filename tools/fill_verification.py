@@ -80,6 +80,15 @@ def taylor_green(r):
     return [r["cells"], r["dt_tau0"], num(r["rms_error_percent"], 3) + " %", num(r["order"], 2) if r["order"] else ""]
 
 
+def splitting(r):
+    return [r["scene"], r["method"], *(f"{float(r[f'error_percent_after_{k}']):.2g} %" for k in (1, 3, 10, 30)),
+            f"{float(r['nonrigidity_after_10']):.1e}", num(r["iterations_mean"], 1)]
+
+
+def flow_steps(r):
+    return [r["way"], num(r["error_percent"], 3) + " %", num(r["fallen_error_percent"], 3) + " %", num(r["flow_over_rest"], 2)]
+
+
 def width_rows():
     table = rows("width")
     base = next(float(r["tip_um"]) for r in table if r["W0_over_d0"] == "10" and r["dx_W0"] == "0.8")
@@ -108,6 +117,9 @@ TABLES = {
     "ellipse_in_shear": lambda: map(ellipse_in_shear, rows("ellipse_in_shear")),
     "falling_disc": lambda: map(falling_disc, rows("falling_disc")), "cavity": lambda: map(cavity, rows("cavity")),
     "taylor_green": lambda: map(taylor_green, rows("taylor_green")),
+    "offsets": lambda: map(lambda r: [r["law"], r["R_W0"], r["ratio"], num(r["offset_W0"], 3), r["reference"],
+                                      f"{float(r['nonrigidity']):.1e}"], rows("offsets")),
+    "splitting": lambda: map(splitting, rows("splitting")), "flow_steps": lambda: map(flow_steps, rows("flow_steps")),
     "width": width_rows, "karma": karma_rows,
 }
 
