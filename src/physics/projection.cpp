@@ -87,7 +87,7 @@ void StokesSolver::project_pass(Vector& x, StokesResult& result) {
   amr::GmresOptions o;
   o.max_iterations = options_.max_iterations;
   o.tolerance = options_.tolerance;
-  const amr::GmresResult m = momentum_.solve(x, pieces_, o, [this](const Vector& now) { return speed(now); });
+  const amr::GmresResult m = momentum_.solve(x, pieces_, o, [this](const Vector& now) { return size(now); });
 
   unpack(x, state_);
   hierarchy_.make_composite(state_, 1, false);
