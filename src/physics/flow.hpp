@@ -116,6 +116,7 @@ class Flow : public Module {
  private:
   void solve(double elapsed);
   void load();
+  double tolerance() const;
   void store(double elapsed);
   void extrapolate(double elapsed);
   void set_viscosity();
