@@ -209,7 +209,6 @@ void Simulation::schedule_regrid() {
 double Simulation::max_dt() const {
   double dt = 1e30;
   for (const auto& m : modules_) dt = std::min(dt, m->max_dt());
-  if (dt > 1e29) dt = settings_.phase_field.max_dt_tau0;
   return dt;
 }
 

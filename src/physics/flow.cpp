@@ -578,12 +578,23 @@ void Flow::solve(double elapsed) {
                         std::max(wanted, 0.5 * interval_), interval_ > 0 ? 2 * interval_ : 1e300});
 }
 
+// Inertia is explicit, and crystals move at the end of a step as they did at its start.
+double Flow::max_dt() const {
+  return options_.courant * mesh_->shape().dx(mesh_->shape().max_level) / std::max(fastest_, 1e-300);
+}
+
 void Flow::advance(double t, double dt, std::int64_t) {
   // At rest at the start, unless walls push melt in: it must go somewhere from the first step on.
   const double elapsed = t > last_ ? t - last_ : t == 0 && options_.through_walls(mesh_->shape()) ? dt : 0;
   if (elapsed <= 0) return;
   if (!due_ && t < next_ * (1 - 1e-12)) return;
   solve(elapsed);
+  // The step was chosen for the velocity before.
+  constexpr double MOST_CELLS = 10;
+  const double cells = fastest_ * dt / mesh_->shape().dx(mesh_->shape().max_level);
+  if (cells > MOST_CELLS * std::max(1.0, options_.courant))
+    throw NumericalError(fmt::format("the flow has become too fast for the step: {:.3g} cells in {:.3g} tau0; a smaller "
+                                     "phase_field.max_dt_tau0 may help", cells, dt));
   measure_motion(*mesh_, psi_, options_.motion == Motion::held ? amr::FaceField{} : v_, crystals_);
   last_ = t;
   next_ = t + interval_;
