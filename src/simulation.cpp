@@ -209,7 +209,6 @@ void Simulation::schedule_regrid() {
 double Simulation::max_dt() const {
   double dt = 1e30;
   for (const auto& m : modules_) dt = std::min(dt, m->max_dt());
-  if (dt > 1e29) dt = settings_.phase_field.max_dt_tau0;
   return dt;
 }
 
@@ -425,11 +424,16 @@ void Simulation::open_output() {
   write_manifest("running");
 }
 
+physics::Report Simulation::report() const {
+  physics::Report r;
+  for (const auto& m : modules_) m->report(r);
+  return r;
+}
+
 void Simulation::write_line(const Totals& t, double dt) {
   if (mesh_->rank() != 0) return;
   const physics::Scales& s = settings_.scales;
-  physics::Report r;
-  for (const auto& m : modules_) m->report(r);
+  const physics::Report r = report();
   diagnostics_csv_->line({static_cast<double>(step_), time_ * s.tau0_s, time_, dt, static_cast<double>(t.blocks),
                           static_cast<double>(t.blocks * volume(filled(mesh_->layout().n))),
                           static_cast<double>(t.levels), t.solid_fraction, t.solute_mean * s.c_l_wt, solute_drift(t),

@@ -81,6 +81,8 @@ class Simulation {
   std::int64_t step_number() const { return step_; }
   Totals totals();
   std::vector<physics::Tip> tips();
+  physics::Report report() const;
+  const std::vector<physics::Seed>& crystals() const { return crystals_; }
   double solute_drift(const Totals& t) const { return (t.solute_mean - initial_solute_) / initial_solute_; }
   double max_dt() const;
   void write_checkpoint(const std::string& path);

@@ -12,6 +12,10 @@ constexpr int LOWEST_EXPONENT = -1152;  // weight of limb 0
 
 void ExactSum::add(double x) {
   if (x == 0) return;
+  if (!std::isfinite(x)) {
+    ++limbs_[LIMBS];
+    return;
+  }
   int exponent = 0;
   const double m = std::frexp(x, &exponent);                          // |m| in [1/2, 1)
   const auto mantissa = static_cast<std::int64_t>(std::ldexp(m, 53));  // x = mantissa * 2^(exponent - 53)
@@ -30,12 +34,14 @@ void ExactSum::add(double x) {
 }
 
 void ExactSum::add(const ExactSum& other) {
-  for (std::size_t i = 0; i < LIMBS; ++i) limbs_[i] += other.limbs_[i];
+  for (std::size_t i = 0; i < limbs_.size(); ++i) limbs_[i] += other.limbs_[i];
 }
 
 double ExactSum::value() const {
+  if (limbs_[LIMBS] != 0) return std::numeric_limits<double>::quiet_NaN();
   // Carry upwards so that each limb holds 32 bits, the sign sitting in the top one alone.
-  std::array<std::int64_t, LIMBS> l = limbs_;
+  std::array<std::int64_t, LIMBS> l{};
+  std::copy_n(limbs_.begin(), LIMBS, l.begin());
   for (std::size_t i = 0; i + 1 < LIMBS; ++i) {
     const std::int64_t carry = l[i] >> 32;
     l[i] -= carry << 32;
@@ -61,8 +67,8 @@ std::vector<double> exact_sums(std::span<ExactSum> local, MPI_Comm comm) {
   std::vector<double> values;
   for (std::size_t i = 0; i < local.size(); ++i) {
     ExactSum s;
-    std::copy_n(all.begin() + static_cast<std::ptrdiff_t>(i * ExactSum::LIMBS), ExactSum::LIMBS,
-                s.limbs().begin());
+    const std::size_t size = s.limbs().size();
+    std::copy_n(all.begin() + static_cast<std::ptrdiff_t>(i * size), size, s.limbs().begin());
     values.push_back(s.value());
   }
   return values;

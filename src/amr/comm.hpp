@@ -17,13 +17,13 @@ class ExactSum {
  public:
   static constexpr int LIMBS = 72;  ///< 32 bits each; the lowest has weight 2^-1152
 
-  void add(double x);  ///< x must be finite
+  void add(double x);
   void add(const ExactSum& other);
-  double value() const;  ///< the sum, rounded at the end only
+  double value() const;  ///< the sum, rounded at the end only; NaN if a summand was not finite
   std::span<std::int64_t> limbs() { return limbs_; }
 
  private:
-  std::array<std::int64_t, LIMBS> limbs_{};
+  std::array<std::int64_t, LIMBS + 1> limbs_{};  // the last one counts summands that are not finite
 };
 
 /// Sums over all ranks, exact before the final rounding. Collective. 

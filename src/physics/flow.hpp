@@ -108,6 +108,7 @@ class Flow : public Module {
   void attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) override;
   void initialize() override;
   void after_regrid() override;
+  double max_dt() const override;
   void advance(double t, double dt, std::int64_t step) override;
   void report(Report& r) const override;
   std::vector<double> memory() const override;
@@ -116,6 +117,7 @@ class Flow : public Module {
  private:
   void solve(double elapsed);
   void load();
+  double tolerance() const;
   void store(double elapsed);
   void extrapolate(double elapsed);
   void set_viscosity();

@@ -14,17 +14,20 @@ namespace {
 std::size_t at(int i) { return static_cast<std::size_t>(i); }
 }  // namespace
 
-// v -= factor * grad p on the unknown faces of the leaves. Ghosts of p are filled.
+// v -= factor * grad p on the unknown faces of the leaves, times sigma/(sigma + kappa) where there is drag: a push of the
+// pressure moves melt, and not the solid that resists it. Ghosts of p are filled.
 void StokesSolver::subtract_gradient(const HierarchyField& p, double factor, HierarchyField& v) const {
   for_leaves([&](int, int g, int i, double dx) {
     const Layout& layout = hierarchy_.grid(g).layout;
     const double* from = p.at(g, i, 0);
     for (int a = 0; a < DIM; ++a) {
       double* to = v.at(g, i, a);
+      const double* mobility = drag_ != nullptr ? mobility_->at(g, i, a) : nullptr;
       const Range r = hierarchy_.unknowns(g, i, components_[at(a)], true);
       amr::for_each_cell(r.lo, r.size, [&](const IntVec& q) {
         const std::ptrdiff_t o = layout.offset(q);
-        to[o] -= factor / dx * (from[o] - from[o - layout.stride(a)]);
+        const double share = mobility != nullptr ? sigma_ * mobility[o] : 1.0;
+        to[o] -= factor * share / dx * (from[o] - from[o - layout.stride(a)]);
       });
     }
   });
@@ -48,7 +51,7 @@ StokesResult StokesSolver::project(Vector& x) {
     pack(image_, r);
     blank(r, true);
   };
-  // -div grad phi = -sigma div v, the gradient put together over the levels before its divergence is taken.
+  // -div [sigma/(sigma + kappa)] grad phi = -sigma div v, the gradient put together over the levels before its divergence is taken.
   poisson_.apply = [this](const Vector& v, Vector& w) {
     unpack(v, work_);
     for_leaves([&](int, int g, int i, double) {
@@ -66,8 +69,12 @@ StokesResult StokesSolver::project(Vector& x) {
     unpack(r, image_);
     cycle_pressure(image_);
     for_leaves([&](int, int g, int i, double) {
-      amr::copy_box(image_.ref(g, i, PRESSURE), {}, std::as_const(pressure_cycle_->solution()).ref(g, i, 0), {},
-                    filled(mesh_.layout().n));
+      const double* from = pressure_cycle_->solution().at(g, i, 0);
+      double* to = image_.at(g, i, PRESSURE);
+      amr::for_each_cell({}, filled(mesh_.layout().n), [&](const IntVec& q) {
+        const std::ptrdiff_t o = mesh_.layout().offset(q);
+        to[o] = drag_ != nullptr ? from[o] / sigma_ : from[o];  // its mobility lacks the sigma
+      });
     });
     remove_mean_pressure(image_);
     pack(image_, r);
@@ -87,7 +94,7 @@ void StokesSolver::project_pass(Vector& x, StokesResult& result) {
   amr::GmresOptions o;
   o.max_iterations = options_.max_iterations;
   o.tolerance = options_.tolerance;
-  const amr::GmresResult m = momentum_.solve(x, pieces_, o, [this](const Vector& now) { return speed(now); });
+  const amr::GmresResult m = momentum_.solve(x, pieces_, o, [this](const Vector& now) { return size(now); });
 
   unpack(x, state_);
   hierarchy_.make_composite(state_, 1, false);

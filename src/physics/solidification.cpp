@@ -101,7 +101,7 @@ int Solidification::stages(double dt) const {
 }
 
 double Solidification::max_dt() const {
-  if (phase_.frozen) return 1e30;
+  if (phase_.frozen) return phase_.max_dt_tau0;
   // The number of stages that costs least per unit of time.
   double best = 0, rate = 1e300;
   for (int s = 1; s <= MAX_STAGES; ++s) {

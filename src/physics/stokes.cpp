@@ -18,6 +18,10 @@ std::size_t at(int i) { return static_cast<std::size_t>(i); }
 // Least sigma + kappa in the pressure's preconditioner, over the largest kappa: so that steady flow has one as well.
 constexpr double FAINT = 1e-6;
 
+// Residual that is round-off, over the norm of velocity and pressure. Melt that stands still under its own weight has a
+// pressure and no velocity that a residual could be compared with.
+constexpr double ROUND_OFF = 1e-13;
+
 constexpr int EDGES = DIM == 2 ? 1 : 3;  // pairs of axes
 
 // Component of viscosity_ that holds the edges along which neither a nor b changes; 0 is the cells.
@@ -431,6 +435,11 @@ double StokesSolver::speed(const Vector& x) const {
   return pieces_.norm(v);
 }
 
+// What the tolerance refers to: the velocity, unless it is lost in the round-off of the pressure.
+double StokesSolver::size(const Vector& x) const {
+  return std::max(speed(x), ROUND_OFF / options_.tolerance * pieces_.norm(x));
+}
+
 // Sets the pressures, or the velocities, to 0.
 void StokesSolver::blank(Vector& v, bool pressures) const {
   const std::ptrdiff_t cells = volume(filled(mesh_.layout().n));
@@ -454,7 +463,7 @@ StokesResult StokesSolver::solve(double sigma) {
   amr::GmresOptions o;
   o.max_iterations = options_.max_iterations;
   o.tolerance = options_.tolerance;
-  const amr::GmresResult g = gmres_.solve(x, pieces_, o, [this](const Vector& now) { return speed(now); });
+  const amr::GmresResult g = gmres_.solve(x, pieces_, o, [this](const Vector& now) { return size(now); });
   StokesResult result;
   result.iterations = g.iterations;
   result.converged = g.converged;

@@ -84,6 +84,7 @@ class StokesSolver {
   void subtract_gradient(const amr::HierarchyField& p, double factor, amr::HierarchyField& v) const;
   void finish(const Vector& x, StokesResult& result);
   double speed(const Vector& x) const;
+  double size(const Vector& x) const;
   void blank(Vector& v, bool pressures) const;
   amr::Pieces plain_pieces() const;
   void pack(const amr::HierarchyField& f, Vector& v) const;

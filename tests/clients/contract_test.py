@@ -342,6 +342,15 @@ def check_numerical_failure(folder):
         saved = [n for n in names(folder / "out") - {checkpoint.name} if n.endswith(f"_{manifest['steps']:07d}.h5")]
         require(saved, f"the state of step {manifest['steps']} was not saved: {sorted(names(folder / 'out'))}")
         (folder / "out" / saved[0]).unlink()
+    for coupling in ("coupled", "projection"):
+        shutil.rmtree(folder / "out")
+        scene.write_text(SCENES[2].format(end=5 * TAU0_S, line=TAU0_S) + "[flow]\nmax_iterations = 1\n")
+        result = run(scene, "output.dir=out", f"flow.coupling={coupling}", code=3, cwd=folder)
+        require(result.err.count("the flow did not converge") == 1, f"no cause, or more than one: {result}")
+        manifest = json.loads((folder / "out/manifest.json").read_text())
+        require((manifest["status"], manifest["exit_code"]) == ("failed", 3) and "did not converge" in manifest["message"],
+                f"status {manifest['status']}, {manifest['exit_code']}, {manifest['message']}")
+        require(f"failed_{manifest['steps']:07d}.h5" in names(folder / "out"), f"not saved: {names(folder / 'out')}")
     say("numerical failure: exit code 3, cause, state")
 
 

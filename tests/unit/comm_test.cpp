@@ -115,6 +115,18 @@ TEST(ExactSum, OfNothingAndOfOne) {
   }
 }
 
+TEST(ExactSum, OfWhatIsNotFinite) {
+  for (const double x : {std::numeric_limits<double>::quiet_NaN(), std::numeric_limits<double>::infinity()}) {
+    EXPECT_TRUE(std::isnan(exact({1, x, 2})));
+    EXPECT_TRUE(std::isnan(exact({1, -x, x})));
+    ExactSum sum, other;
+    sum.add(1);
+    other.add(x);
+    sum.add(other);
+    EXPECT_TRUE(std::isnan(exact_sums(std::span(&sum, 1), MPI_COMM_SELF).front()));
+  }
+}
+
 TEST(ExactSum, RoundsAtTheEndOnly) {
   // Below a rounding error of the final number nothing is promised; above it nothing may be lost.
   for (const double sign : {1.0, -1.0}) {
