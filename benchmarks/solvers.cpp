@@ -209,6 +209,50 @@ void scalar(benchmark::State& state, int levels, double ratio, Beside beside) {
   state.counters["ratio_max"] = greatest(ratios);
 }
 
+// (1/dt - div 2 nu D) v = f on a uniform grid, dt nu/dx^2 = 500 where nu = 1; nu in the disc is `ratio`. With the pressure:
+// the coupled system.
+enum class Unknowns { velocity, all };
+
+void viscous(benchmark::State& state, Unknowns unknowns) {
+  constexpr int CELLS_ALONG = DIM == 2 ? 512 : 64, BLOCK = 16;
+  const double ratio = static_cast<double>(state.range(0));
+  const amr::Mesh mesh = unit_box(CELLS_ALONG, 0, BLOCK);
+  const double dx = 1.0 / CELLS_ALONG, sigma = 1 / (500 * dx * dx);
+  physics::StokesOptions options;
+  options.tolerance = unknowns == Unknowns::velocity ? 1e-8 : 1e-6;
+  physics::StokesSolver solver(mesh, options);
+  solver.set_viscosity(
+      [&](int b, double* phi) {
+        amr::for_each_cell(filled(-amr::Layout::GHOSTS), filled(mesh.layout().pitch()), [&](const IntVec& q) {
+          RealVec x{};
+          for (int a = 0; a < DIM; ++a) x[a] = mesh.block(b).lo[a] + (q[a] + 0.5) * dx;
+          phi[mesh.layout().offset(q)] = std::tanh((RADIUS - from_centre(x)) / (2 * dx));
+        });
+      },
+      [&](double phi) { return 1 + (ratio - 1) * 0.5 * (1 + phi); });
+  for (int a = 0; a < DIM; ++a)
+    for_each_place(mesh, solver.hierarchy(), a, [&](int g, int i, std::ptrdiff_t o, const RealVec& x, int, const IntVec&) {
+      double f = a == 0 ? 1 : -1;
+      for (int d = 0; d < DIM; ++d) f *= (d == a ? std::cos(3 * x[d]) : std::sin(5 * x[d]));
+      solver.force().at(g, i, a)[o] = f;
+    });
+  physics::StokesResult result;
+  std::vector<double> us;
+  const auto run = [&] {
+    return 1e6 / cells_of(mesh) * timed([&] {
+      for (int g = 0; g < solver.hierarchy().levels(); ++g) solver.state().clear(g);
+      result = unknowns == Unknowns::velocity ? solver.solve_momentum(sigma) : solver.solve(sigma);
+    });
+  };
+  run();
+  for (auto _ : state) {
+    us.push_back(run());
+    state.SetIterationTime(1e-6 * us.back() * cells_of(mesh));
+  }
+  if (!result.converged) state.SkipWithError("not converged");
+  report(state, us, result.iterations, result.error, cells_of(mesh));
+}
+
 void solutions(benchmark::internal::Benchmark* b) {
   b->UseManualTime()->Repetitions(1)->Iterations(9)->Unit(benchmark::kMillisecond)->Arg(16);
   if (DIM == 2) b->Arg(32);
@@ -218,6 +262,14 @@ BENCHMARK_CAPTURE(scalar, uniform, 0, 1.0, Beside::pfmg)->Name("multigrid_unifor
 BENCHMARK_CAPTURE(scalar, levels, DIM == 2 ? 4 : 2, 1.0, Beside::nothing)->Name("multigrid_levels")->Apply(solutions);
 BENCHMARK_CAPTURE(scalar, uniform_beta, 0, 1e3, Beside::pfmg)->Name("multigrid_uniform_beta")->Apply(solutions);
 BENCHMARK_CAPTURE(scalar, levels_beta, DIM == 2 ? 4 : 2, 1e3, Beside::nothing)->Name("multigrid_levels_beta")->Apply(solutions);
+
+void ratios(benchmark::internal::Benchmark* b) {
+  b->UseManualTime()->Repetitions(1)->Iterations(5)->Unit(benchmark::kMillisecond);
+  for (const int r : {1, 100, 10000, 1000000}) b->Arg(r);
+}
+
+BENCHMARK_CAPTURE(viscous, velocity, Unknowns::velocity)->Name("viscous_velocity")->Apply(ratios);
+BENCHMARK_CAPTURE(viscous, all, Unknowns::all)->Name("viscous_coupled")->Apply(ratios);
 
 }  // namespace
 

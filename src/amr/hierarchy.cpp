@@ -350,7 +350,10 @@ void Hierarchy::run(Route& r, Size&& size, Pack&& pack, Unpack&& unpack, Direct&
     if (total > 0)
       MPI_Isend(m.send_buffer.data(), static_cast<int>(total), MPI_DOUBLE, m.rank, TAG, mesh_.comm(), &requests.emplace_back());
   }
-  parallel_for(static_cast<int>(r.local.size()), [&](int i) { direct(r.local[at(i)]); });
+  // Small and alike: handing them out one by one would cost as much as they do.
+  const std::ptrdiff_t count = static_cast<std::ptrdiff_t>(r.local.size());
+#pragma omp parallel for schedule(static) if (count > 1)
+  for (std::ptrdiff_t i = 0; i < count; ++i) direct(r.local[static_cast<std::size_t>(i)]);
   MPI_Waitall(static_cast<int>(requests.size()), requests.data(), MPI_STATUSES_IGNORE);
   for (Message& m : r.messages) {
     const double* p = m.recv_buffer.data();
@@ -445,6 +448,15 @@ void Hierarchy::exchange(HierarchyField& f, int g, int depth, bool homogeneous) 
           const GhostCopy& k = box(item, c);
           double* dst = f.at(g, gr.nodes[at(item.dst)].local, c) + k.dst;
           const double* src = f.at(g, item.src, c) + k.src;
+          if (k.size[0] == 2) {  // columns: no loop along x
+            for_each_row(k.size, [&](const IntVec& row) {
+              const std::ptrdiff_t o = layout.offset(row);
+              const double first = src[o], second = src[o + 1];
+              dst[o] = first;
+              dst[o + 1] = second;
+            });
+            continue;
+          }
           for_each_row(k.size, [&](const IntVec& row) {
             const std::ptrdiff_t o = layout.offset(row);
             for (int i = 0; i < k.size[0]; ++i) dst[o + i] = src[o + i];

@@ -159,10 +159,19 @@ GcrResult Gcr::solve(Vector& x, Vector& r, const Pieces& pieces, const GcrOption
   const auto norms_of_piece = [&](int i, std::size_t begin, std::size_t end) {
     const double *v = r.data(), *weight = pieces.weight.data();
     double sum = 0, most = 0;
+    if (pieces.alike) {
 #pragma omp simd reduction(+ : sum) reduction(max : most)
-    for (std::size_t q = begin; q < end; ++q) {
-      sum += weight[q] * v[q] * v[q];
-      most = std::max(most, std::abs(v[q]));
+      for (std::size_t q = begin; q < end; ++q) {
+        sum += v[q] * v[q];
+        most = std::max(most, std::abs(v[q]));
+      }
+      sum *= weight[begin];
+    } else {
+#pragma omp simd reduction(+ : sum) reduction(max : most)
+      for (std::size_t q = begin; q < end; ++q) {
+        sum += weight[q] * v[q] * v[q];
+        most = std::max(most, std::abs(v[q]));
+      }
     }
     partial[at(i)] = sum;
     largest_of[at(i)] = most;
@@ -187,6 +196,11 @@ GcrResult Gcr::solve(Vector& x, Vector& r, const Pieces& pieces, const GcrOption
       const double *w = w_[now].data(), *weight = pieces.weight.data();
       const auto product = [&](const double* v) {
         double sum = 0;
+        if (pieces.alike) {
+#pragma omp simd reduction(+ : sum)
+          for (std::size_t q = begin; q < end; ++q) sum += w[q] * v[q];
+          return sum * weight[begin];
+        }
 #pragma omp simd reduction(+ : sum)
         for (std::size_t q = begin; q < end; ++q) sum += weight[q] * w[q] * v[q];
         return sum;

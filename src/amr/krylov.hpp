@@ -15,6 +15,7 @@ namespace dendrift::amr {
 struct Pieces {
   std::vector<std::ptrdiff_t> first{0};  ///< first[i] to first[i+1]: piece i
   std::vector<double> weight;            ///< of each entry in products, > 0
+  bool alike = false;                    ///< weights within a piece are all the same
   MPI_Comm comm = MPI_COMM_NULL;
 
   std::size_t size() const { return static_cast<std::size_t>(first.back()); }

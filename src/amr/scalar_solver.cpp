@@ -57,6 +57,7 @@ ScalarSolver::ScalarSolver(const Mesh& mesh, const std::array<MirrorRule, FACES>
       cycle_(hierarchy_, {Component{-1, sides}}, beta_, options.cycle) {
   if (options.method == ScalarMethod::hypre && !HypreSolver::available()) throw std::runtime_error("this build has no hypre");
   pieces_.comm = mesh.comm();
+  pieces_.alike = true;
   const std::ptrdiff_t cells = volume(filled(mesh.layout().n));
   const double finest = hierarchy_.grid(0).dx;
   for (int b = 0; b < mesh.size(); ++b) {

@@ -30,6 +30,64 @@ void StokesSolver::subtract_gradient(const HierarchyField& p, double factor, Hie
   });
 }
 
+void StokesSolver::precondition_momentum(const Vector& r, Vector& z) {
+  unpack(r, image_);
+  for_leaves([&](int, int g, int i, double) {
+    std::fill_n(pressure_.at(g, i, 0) - mesh_.layout().interior(), mesh_.layout().size(), 0.0);
+  });
+  cycle_velocity(image_);
+  pack(image_, z);
+  blank(z, true);
+}
+
+StokesResult StokesSolver::solve_momentum(double sigma) {
+  constexpr int DIRECTIONS_KEPT = 12;
+  sigma_ = sigma;
+  velocity_cycle_->prepare(velocity_links(sigma), drag_.get());
+  amr::Gcr gcr;
+  gcr.precondition = [this](const Vector& r, Vector& z) { precondition_momentum(r, z); };
+  gcr.apply = [this](const Vector& z, Vector& w) {
+    w.resize(z.size());
+    gmres_.apply(z, w);
+    blank(w, true);
+  };
+  const auto largest = [&](const Vector& v) {
+    double most = 0;
+    for (const double q : v) most = std::max(most, std::abs(q));
+    return amr::global_max(most, mesh_.comm());
+  };
+  // The right-hand side: what is left of it where v = 0.
+  Vector x, r, b;
+  pack(state_, x);
+  const auto residual = [&](const Vector& of, Vector& left) {
+    left.resize(of.size());
+    gmres_.residual(of, left);
+    blank(left, true);
+  };
+  Vector rest = x;
+  for (int k = 0; k < mesh_.size(); ++k) {
+    const std::ptrdiff_t cells = volume(filled(mesh_.layout().n));
+    std::fill(rest.begin() + pieces_.first[at(k)], rest.begin() + pieces_.first[at(k) + 1] - cells, 0.0);
+  }
+  residual(rest, b);
+  const double norm = std::max(pieces_.norm(b), 1e-300), most = std::max(largest(b), 1e-300);
+  StokesResult result;
+  constexpr int PASSES = 3;
+  for (int pass = 0; pass <= PASSES; ++pass) {
+    residual(x, r);
+    result.error = std::max(pieces_.norm(r) / norm, largest(r) / most);
+    result.converged = result.error <= options_.tolerance;
+    if (result.converged || pass == PASSES || result.iterations >= options_.max_iterations) break;
+    const amr::GcrOptions o{.tolerance = 0.95 * options_.tolerance,
+                            .max_iterations = options_.max_iterations - result.iterations,
+                            .directions = DIRECTIONS_KEPT};
+    result.iterations += gcr.solve(x, r, pieces_, o, norm, most).iterations;
+  }
+  unpack(x, state_);
+  fill_state();
+  return result;
+}
+
 StokesResult StokesSolver::project(Vector& x) {
   momentum_.residual = [this](const Vector& now, Vector& r) {
     gmres_.residual(now, r);
@@ -39,15 +97,7 @@ StokesResult StokesSolver::project(Vector& x) {
     gmres_.apply(v, w);
     blank(w, true);
   };
-  momentum_.precondition = [this](Vector& r) {
-    unpack(r, image_);
-    for_leaves([&](int, int g, int i, double) {
-      std::fill_n(pressure_.at(g, i, 0) - mesh_.layout().interior(), mesh_.layout().size(), 0.0);
-    });
-    cycle_velocity(image_);
-    pack(image_, r);
-    blank(r, true);
-  };
+  momentum_.precondition = [this](Vector& r) { precondition_momentum(r, r); };
   // -div grad phi = -sigma div v, the gradient put together over the levels before its divergence is taken.
   poisson_.apply = [this](const Vector& v, Vector& w) {
     unpack(v, work_);

@@ -64,6 +64,10 @@ class StokesSolver {
                 const std::vector<RealVec>& centres);
 
   StokesResult solve(double sigma);
+  /// The velocities alone, the pressure of state() held: sigma v - div[...] = f - grad p. Conjugate residuals round the
+  /// cycle of the coupled solver; tolerance and `error` are of the true residual over the right-hand side, in the 2-norm and
+  /// in the largest entry.
+  StokesResult solve_momentum(double sigma);
   /// Fills parents and ghosts of state(). Collective.
   void fill_state() { hierarchy_.make_composite(state_, amr::Layout::GHOSTS, false); }
 
@@ -76,6 +80,7 @@ class StokesSolver {
   void precondition(amr::HierarchyField& r);
   void cycle_pressure(amr::HierarchyField& r);
   void cycle_velocity(amr::HierarchyField& r);
+  void precondition_momentum(const Vector& r, Vector& z);
   StokesResult project(Vector& x);
   void project_pass(Vector& x, StokesResult& result);
   void subtract_gradient(const amr::HierarchyField& p, double factor, amr::HierarchyField& v) const;
