@@ -1,5 +1,4 @@
 // Whole solutions of elliptic problems: cells and levels of the program beside hypre on one plain grid.
-#include <cstdlib>
 #include <memory>
 
 #include "amr/scalar_solver.hpp"
@@ -136,15 +135,7 @@ void scalar(benchmark::State& state, int levels, double ratio, Beside beside) {
   const Jump jump{ratio, 1.0 / (base << levels)};
   std::array<amr::MirrorRule, FACES> walls{};
   for (amr::MirrorRule& w : walls) w.odd = true;
-  amr::ScalarOptions options;
-  if (const char* d = std::getenv("GCR_DIRECTIONS")) options.directions = std::atoi(d);
-  if (const char* d = std::getenv("MG_LOWEST")) options.cycle.lowest = std::atof(d);
-  if (const char* d = std::getenv("MG_OLD")) {
-    options.cycle = {};
-    options.cycle.smoothings = std::atoi(d);
-    if (const char* l = std::getenv("MG_LOWEST")) options.cycle.lowest = std::atof(l);
-  }
-  amr::ScalarSolver solver(mesh, walls, options);
+  amr::ScalarSolver solver(mesh, walls);
   std::vector<double> plain_f(beside == Beside::pfmg ? static_cast<std::size_t>(cells_of(mesh)) : 0), plain_x;
   for_each_place(mesh, solver.hierarchy(), -1, [&](int g, int i, std::ptrdiff_t o, const RealVec& x, int b, const IntVec& q) {
     solver.rhs().at(g, i, 0)[o] = source(x, jump);

@@ -802,9 +802,10 @@ void Hierarchy::match_fluxes(const HierarchyField& x, HierarchyField& y, int g, 
       });
 }
 
-void Hierarchy::make_composite(HierarchyField& f, int depth, bool homogeneous) {
-  for (int g = 0; g + 1 < levels_; ++g) restrict_means(f, f, g);
-  for (int g = levels_ - 1; g >= 0; --g) {
+void Hierarchy::make_composite(HierarchyField& f, int depth, bool homogeneous, bool parents) {
+  const int last = parents ? levels_ - 1 : coarsest_leaf_;
+  for (int g = 0; g < last; ++g) restrict_means(f, f, g);
+  for (int g = last; g >= 0; --g) {
     fill_from_coarser(f, g);
     exchange(f, g, g == 0 ? depth : G, homogeneous);
   }

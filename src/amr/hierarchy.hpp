@@ -157,7 +157,8 @@ class Hierarchy {
   /// Whether grids from g on have leaves, on any rank.
   bool leaves_from(int g) const { return g <= coarsest_leaf_; }
   /// Leaves have data: fills parents, then all ghosts, so that every leaf sees the composite solution round it.
-  void make_composite(HierarchyField& f, int depth, bool homogeneous);
+  /// `parents`: those beneath the coarsest leaves too.
+  void make_composite(HierarchyField& f, int depth, bool homogeneous, bool parents = true);
 
  private:
   // A box of ghosts in arrays of one layout, and where it comes from in the source's array.

@@ -56,14 +56,15 @@ ScalarSolver::ScalarSolver(const Mesh& mesh, const std::array<MirrorRule, FACES>
       rhs_(hierarchy_, {Component{-1, sides}}), beta_(hierarchy_, faces_of_all_axes()),
       cycle_(hierarchy_, {Component{-1, sides}}, beta_, options.cycle) {
   if (options.method == ScalarMethod::hypre && !HypreSolver::available()) throw std::runtime_error("this build has no hypre");
-  pieces_.comm = mesh.comm();
-  pieces_.alike = true;
+  volumes_.comm = mesh.comm();
+  volumes_.alike = true;
   const std::ptrdiff_t cells = volume(filled(mesh.layout().n));
   const double finest = hierarchy_.grid(0).dx;
   for (int b = 0; b < mesh.size(); ++b) {
-    pieces_.first.push_back((b + 1) * cells);
-    pieces_.weight.insert(pieces_.weight.end(), static_cast<std::size_t>(cells), std::pow(mesh.block(b).dx / finest, DIM));
+    volumes_.first.push_back((b + 1) * cells);
+    volumes_.weight.insert(volumes_.weight.end(), static_cast<std::size_t>(cells), std::pow(mesh.block(b).dx / finest, DIM));
   }
+  pieces_ = volumes_;
   gcr_.precondition = [this](const Vector& r, Vector& z) {
     unpack(r, cycle_.rhs());
     cycle_.cycle();
@@ -98,7 +99,27 @@ void ScalarSolver::prepare_links(double sigma, const Links& links) {
   Links all = links;
   all.sigma = sigma;
   cycle_.prepare({all});
+  weigh();
   if (options_.method == ScalarMethod::hypre) assemble();
+}
+
+// Residuals over the diagonal: a small error where beta is large would hide what is left everywhere else.
+void ScalarSolver::weigh() {
+  pieces_.alike = kappa_[0] < 0;
+  pieces_.weight = volumes_.weight;
+  if (pieces_.alike) return;
+  parallel_for(mesh_.size(), [&](int b) {
+    const auto [g, i] = hierarchy_.place_of_block(b);
+    const Layout& layout = mesh_.layout();
+    const double over = 1 / (mesh_.block(b).dx * mesh_.block(b).dx);
+    double* w = pieces_.weight.data() + pieces_.first[at(b)];
+    for_each_cell({}, filled(layout.n), [&, g = g, i = i](const IntVec& q) {
+      const std::ptrdiff_t o = layout.offset(q);
+      double links = 0;
+      for (int a = 0; a < DIM; ++a) links += beta_.at(g, i, a)[o] + beta_.at(g, i, a)[o + layout.stride(a)];
+      *w++ /= sigma_ + over * links;
+    });
+  });
 }
 
 // Parents conduct as their finer faces do together; all nodes get two layers beyond their sides.
@@ -125,13 +146,8 @@ void ScalarSolver::spread_beta() {
 
 // What every leaf sees round it, with fluxes that agree where levels meet.
 void ScalarSolver::fill(HierarchyField& f, bool homogeneous) {
-  int last = 0;
-  for (; hierarchy_.leaves_from(last + 1); ++last) hierarchy_.restrict_means(f, f, last);
-  for (int g = last; g >= 0; --g) {
-    hierarchy_.fill_from_coarser(f, g);
-    hierarchy_.exchange(f, g, g == 0 ? 1 : Layout::GHOSTS, homogeneous);
-  }
-  for (int g = 0; g < last; ++g) hierarchy_.match_fluxes(f, f, g, beta_, kappa_);
+  hierarchy_.make_composite(f, 1, homogeneous, false);
+  for (int g = 0; hierarchy_.leaves_from(g + 1); ++g) hierarchy_.match_fluxes(f, f, g, beta_, kappa_);
 }
 
 void ScalarSolver::apply(HierarchyField& x, bool homogeneous, const HierarchyField* rhs, Vector& y) {
@@ -181,7 +197,7 @@ void ScalarSolver::remove_mean(Vector& v) const {
   if (!floating_) return;
   const Vector one(v.size(), 1.0);
   const std::vector<Vector> with{v, one};
-  const std::vector<double> p = pieces_.products(one, with);
+  const std::vector<double> p = volumes_.products(one, with);
   const double mean = p[0] / p[1];
   for (double& q : v) q -= mean;
 }
@@ -230,7 +246,7 @@ ScalarResult ScalarSolver::solve() {
     apply(state_, false, &rhs_, b);
     unpack(x, state_);
   }
-  const double norm = pieces_.norm(b), most = largest(b);
+  const double norm = volumes_.norm(b), weighted = pieces_.norm(b), most = largest(b);
   ScalarResult result;
   if (norm == 0) {
     unpack(Vector(x.size(), 0.0), state_);
@@ -242,7 +258,7 @@ ScalarResult ScalarSolver::solve() {
   constexpr int PASSES = 4;
   for (int pass = 0; pass <= PASSES; ++pass) {
     apply(state_, false, &rhs_, r);
-    result.residual = pieces_.norm(r) / norm;
+    result.residual = volumes_.norm(r) / norm;
     result.largest = largest(r) / most;
     result.rounding = rounding(x) / most;
     const double enough = std::max(options_.tolerance, result.rounding);
@@ -256,7 +272,7 @@ ScalarResult ScalarSolver::solve() {
       o.tolerance = 0.95 * options_.tolerance;
       o.max_iterations = options_.max_iterations - result.iterations;
       o.directions = options_.directions;
-      result.iterations += gcr_.solve(x, r, pieces_, o, norm, most).iterations;
+      result.iterations += gcr_.solve(x, r, pieces_, o, weighted, most).iterations;
     }
     unpack(x, state_);
   }

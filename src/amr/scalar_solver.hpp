@@ -55,6 +55,7 @@ class ScalarSolver {
  private:
   using Vector = Gcr::Vector;
   void prepare_links(double sigma, const Links& links);
+  void weigh();
   void spread_beta();
   void fill(HierarchyField& f, bool homogeneous);
   /// A x, or rhs - A x if `rhs` is given.
@@ -73,7 +74,7 @@ class ScalarSolver {
   HierarchyField state_, rhs_, beta_;
   Multigrid cycle_;
   Gcr gcr_;
-  Pieces pieces_;
+  Pieces pieces_, volumes_;  // weighted for the Krylov method, and with volumes alone
   Array<int> kappa_{};
   double sigma_ = 0, factor_ = 1;
   bool floating_ = true;  // the constant is free
