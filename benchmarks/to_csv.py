@@ -3,7 +3,8 @@
 
 One line a benchmark: median, min and max of its speed in Mcell updates a second and core, and, for paired rows, the
 median, min and max of the ratio of its time per update to that of the plain uniform loop. Rows on a tree say
-how many cells the scene needs, and what one stage of them takes: cells / speed.
+how many cells the scene needs, and what one stage of them takes: cells / speed. Rows of solvers: microseconds a cell for
+the whole solution.
 """
 import csv
 import json
@@ -11,7 +12,8 @@ import sys
 
 COLUMNS = ["name", "median_Mcell_per_s", "min_Mcell_per_s", "max_Mcell_per_s", "plain_Mcell_per_s", "ratio",
            "ratio_min", "ratio_max", "cells", "blocks", "stages", "ms_per_stage", "interface_share", "ghost_time_share",
-           "regrid_time_share", "machine", "commit", "date"]
+           "regrid_time_share", "us_per_cell", "us_min", "us_max", "iterations", "us_per_iteration", "residual",
+           "hypre_us_per_cell", "hypre_iterations", "machine", "commit", "date"]
 
 
 def rows(results):
@@ -28,6 +30,9 @@ def rows(results):
                 row[f"{name}_Mcell_per_s"] = speed
             if name != "median":
                 continue
+        elif "us_per_cell" in b:  # a whole solution of equations
+            row.update({k: b[k] for k in COLUMNS if k in b and k != "name"})
+            continue
         elif "ratio" in b:  # a paired row: one repetition of many pairs
             row["median_Mcell_per_s"] = speed
         else:

@@ -37,6 +37,11 @@ int towards(int axis, int step) {
   return direction_index(o);
 }
 
+// A node beside a coarser leaf, and that leaf: parents never are, or levels would differ by two.
+const Grid::Node& leaf_beyond(const Grid::Node& n, int face, const Grid& coarse) {
+  return coarse.nodes[at(coarse.nodes[at(n.parent)].neighbours[at(direction_index(face_offset(face)))])];
+}
+
 // Adds the linear interpolation of a coarse array to a fine one: a line of coarse values for every fine row, weighted
 // 3:1 across rows of cells and 1:1 between planes of faces, then the same along the row.
 void add_linear(const ArrayRef<double>& x, const ArrayRef<const double>& coarse, const Range& box, int normal, int n) {
@@ -116,6 +121,8 @@ Hierarchy::Hierarchy(const Mesh& mesh) : mesh_(mesh), rank_(mesh.rank()) {
   add_grids_beneath();
   routes_.resize(grids_.size());
   for (int g = 0; g < grids(); ++g) connect(g);
+  for (int g = 0; g < levels_; ++g)
+    if (std::ranges::any_of(grid(g).nodes, [](const Grid::Node& n) { return n.leaf >= 0; })) coarsest_leaf_ = g;
   for (int g = 0; g < grids(); ++g) build_routes(g);
   places_.resize(at(mesh.size()));
   for (int g = 0; g < levels_; ++g)
@@ -309,6 +316,15 @@ void Hierarchy::build_routes(int g) {
         emit(Item{q.local, static_cast<int>(i), a, static_cast<int>(i) * DIM + a, {}}, q.owner, n.owner);
       }
   });
+  r.to_border = make_route([&](auto&& emit) {
+    for (std::size_t i = 0; i < grid.nodes.size(); ++i)
+      for (int f = 0; f < FACES; ++f) {
+        const Grid::Node& n = grid.nodes[i];
+        if (g + 1 >= levels_ || n.neighbours[at(direction_index(face_offset(f)))] != Grid::COARSER) continue;
+        const Grid::Node& q = leaf_beyond(n, f, coarse);
+        emit(Item{q.local, static_cast<int>(i), f, static_cast<int>(i) * FACES + f, {}}, q.owner, n.owner);
+      }
+  });
 }
 
 template <class Size, class Pack, class Unpack, class Direct>
@@ -334,7 +350,10 @@ void Hierarchy::run(Route& r, Size&& size, Pack&& pack, Unpack&& unpack, Direct&
     if (total > 0)
       MPI_Isend(m.send_buffer.data(), static_cast<int>(total), MPI_DOUBLE, m.rank, TAG, mesh_.comm(), &requests.emplace_back());
   }
-  parallel_for(static_cast<int>(r.local.size()), [&](int i) { direct(r.local[at(i)]); });
+  // Small and alike: handing them out one by one would cost as much as they do.
+  const std::ptrdiff_t count = static_cast<std::ptrdiff_t>(r.local.size());
+#pragma omp parallel for schedule(static) if (count > 1)
+  for (std::ptrdiff_t i = 0; i < count; ++i) direct(r.local[static_cast<std::size_t>(i)]);
   MPI_Waitall(static_cast<int>(requests.size()), requests.data(), MPI_STATUSES_IGNORE);
   for (Message& m : r.messages) {
     const double* p = m.recv_buffer.data();
@@ -429,6 +448,15 @@ void Hierarchy::exchange(HierarchyField& f, int g, int depth, bool homogeneous) 
           const GhostCopy& k = box(item, c);
           double* dst = f.at(g, gr.nodes[at(item.dst)].local, c) + k.dst;
           const double* src = f.at(g, item.src, c) + k.src;
+          if (k.size[0] == 2) {  // columns: no loop along x
+            for_each_row(k.size, [&](const IntVec& row) {
+              const std::ptrdiff_t o = layout.offset(row);
+              const double first = src[o], second = src[o + 1];
+              dst[o] = first;
+              dst[o + 1] = second;
+            });
+            continue;
+          }
           for_each_row(k.size, [&](const IntVec& row) {
             const std::ptrdiff_t o = layout.offset(row);
             for (int i = 0; i < k.size[0]; ++i) dst[o + i] = src[o + i];
@@ -560,6 +588,41 @@ void Hierarchy::prolong_add(HierarchyField& f, int g) {
   });
 }
 
+void Hierarchy::prolong_add_shared(HierarchyField& f, const HierarchyField& shares, int g) {
+  const int n = grid(g).layout.n;
+  with_parents(f, g, routes_[at(g)].from_parent, [&](int i, const Parents& parents) {
+    const ArrayRef<double> x = f.ref(g, i, 0);
+    const ArrayRef<const double>& coarse = parents[0];
+    for_each_row(filled(n), [&](const IntVec& row) {
+      IntVec above = row;
+      for (int a = 1; a < DIM; ++a) above[a] = row[a] >> 1;
+      above[0] = 0;
+      const double* c = coarse.at(above);
+      Array<std::ptrdiff_t> to{};
+      for (int a = 1; a < DIM; ++a) to[a] = (row[a] & 1) != 0 ? coarse.stride[a] : -coarse.stride[a];
+      double* out = x.at(row);
+      Array<const double*> w{};
+      for (int a = 0; a < DIM; ++a) w[a] = shares.ref(g, i, a).at(row);
+      const auto along_y = [&](const double* p, int k) { return p[0] + w[1][k] * (p[to[1]] - p[0]); };
+      const auto across = [&](const double* p, int k) {
+        double v = along_y(p, k);
+        if constexpr (DIM == 3) v += w[2][k] * (along_y(p + to[2], k) - v);
+        return v;
+      };
+      const auto both = [&](int k, int towards_x) {
+        const double* p = c + (k >> 1);
+        const double own = across(p, k);
+        return own + w[0][k] * (across(p + towards_x, k) - own);
+      };
+      for (int k = 0; k < n; k += 2) {
+        out[k] += both(k, -1);
+        out[k + 1] += both(k + 1, 1);
+      }
+    });
+    fill_coarse_ghosts(f, g, i, parents);
+  });
+}
+
 // value(array, place in the finer grid, normal, below, above): what a coarse cell or face receives from the fine ones
 // that start at that place.
 template <class Value>
@@ -657,9 +720,92 @@ void Hierarchy::restrict_weighted(const HierarchyField& from, HierarchyField& to
   });
 }
 
-void Hierarchy::make_composite(HierarchyField& f, int depth, bool homogeneous) {
-  for (int g = 0; g + 1 < levels_; ++g) restrict_means(f, f, g);
-  for (int g = levels_ - 1; g >= 0; --g) {
+void Hierarchy::restrict_links(HierarchyField& f, int g) {
+  restrict_by(f, f, g, [](const double* p, const Array<std::ptrdiff_t>& stride, int normal, bool no_below, bool is_plane) {
+    if (is_plane) return mean_across(p, stride, normal);
+    const std::ptrdiff_t s = stride[normal];
+    double sum = 0;
+    for (int corner = 0; corner < CHILDREN; ++corner) {
+      if ((corner >> normal & 1) != 0) continue;
+      const double* q = p;
+      for (int a = 0; a < DIM; ++a) q += (corner >> a & 1) != 0 ? stride[a] : 0;
+      sum += 1 / (0.5 / q[0] + 0.25 / q[no_below ? 0 : -s] + 0.25 / q[s]);
+    }
+    return sum / (CHILDREN / 2);
+  });
+}
+
+void Hierarchy::restrict_made(const std::function<ArrayRef<const double>(int)>& array, HierarchyField& to, int g) {
+  const Grid& gr = grid(g);
+  const IntVec size = filled(gr.layout.n / 2);
+  const auto local = [&](const Item& item) { return gr.nodes[at(item.src)].local; };
+  run(
+      routes_[at(g)].to_parent, [&](const Item&) { return volume(size); },
+      [&](const Item& item, double* p) { restrict_box(packed_ref(p, size), {}, array(local(item)), {}, size); },
+      [&](const Item& item, const double* p) {
+        copy_box(to.ref(g + 1, item.dst, 0), gr.nodes[at(item.src)].place, packed_ref(p, size), {}, size);
+      },
+      [&](const Item& item) {
+        restrict_box(to.ref(g + 1, item.dst, 0), gr.nodes[at(item.src)].place, array(local(item)), {}, size);
+      });
+}
+
+void Hierarchy::match_fluxes(const HierarchyField& x, HierarchyField& y, int g, const HierarchyField& coefficients,
+                             const Array<int>& kappa) {
+  const Grid& gr = grid(g);
+  const int cells = gr.layout.n;
+  const auto size = [&](int axis) {
+    IntVec s = filled(cells / 2);
+    s[axis] = 1;
+    return s;
+  };
+  // Mean over the finer faces of kappa times the difference inwards to outwards.
+  const auto fluxes = [&](const Item& item, double* p) {
+    const int a = face_axis(item.tag), i = gr.nodes[at(item.src)].local;
+    const bool high = face_is_high(item.tag);
+    const ArrayRef<const double> u = x.ref(g, i, 0);
+    const double* k = kappa[a] < 0 ? nullptr : coefficients.at(g, i, kappa[a]);
+    const std::ptrdiff_t out = high ? u.stride[a] : -u.stride[a], face = high ? u.stride[a] : 0;
+    for_each_cell({}, size(a), [&](const IntVec& q) {
+      IntVec fine{};
+      for (int b = 0; b < DIM; ++b) fine[b] = b == a ? (high ? cells - 1 : 0) : 2 * q[b];
+      double sum = 0;
+      for (int corner = 0; corner < CHILDREN; ++corner) {
+        if ((corner >> a & 1) != 0) continue;
+        std::ptrdiff_t o = u.at(fine) - u.p;
+        for (int b = 0; b < DIM; ++b) o += (corner >> b & 1) != 0 ? u.stride[b] : 0;
+        sum += (k == nullptr ? 1.0 : k[o + face]) * (u.p[o] - u.p[o + out]);
+      }
+      *p++ = sum / (CHILDREN / 2);
+    });
+  };
+  const auto use = [&](const Item& item, const double* p) {
+    const int a = face_axis(item.tag);
+    const bool high = face_is_high(item.tag);
+    const Grid::Node& n = gr.nodes[at(item.src)];
+    const ArrayRef<double> u = y.ref(g + 1, item.dst, 0);
+    const double* k = kappa[a] < 0 ? nullptr : coefficients.at(g + 1, item.dst, kappa[a]);
+    for_each_cell({}, size(a), [&](const IntVec& q) {
+      IntVec c{};
+      for (int b = 0; b < DIM; ++b) c[b] = b == a ? (high ? 0 : cells - 1) : n.place[b] + q[b];
+      const std::ptrdiff_t o = u.at(c) - u.p, ghost = high ? -u.stride[a] : u.stride[a];
+      const double weight = k == nullptr ? 2.0 : 2.0 / k[high ? o : o + ghost];  // half the spacing
+      u.p[o + ghost] = u.p[o] + weight * *p++;
+    });
+  };
+  run(
+      routes_[at(g)].to_border, [&](const Item& item) { return volume(size(face_axis(item.tag))); }, fluxes, use,
+      [&](const Item& item) {
+        std::array<double, DIM == 2 ? 16 : 256> values;
+        fluxes(item, values.data());
+        use(item, values.data());
+      });
+}
+
+void Hierarchy::make_composite(HierarchyField& f, int depth, bool homogeneous, bool parents) {
+  const int last = parents ? levels_ - 1 : coarsest_leaf_;
+  for (int g = 0; g < last; ++g) restrict_means(f, f, g);
+  for (int g = last; g >= 0; --g) {
     fill_from_coarser(f, g);
     exchange(f, g, g == 0 ? depth : G, homogeneous);
   }

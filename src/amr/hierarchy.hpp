@@ -6,6 +6,7 @@
 #include <mpi.h>
 
 #include <array>
+#include <functional>
 #include <vector>
 
 #include "amr/mesh.hpp"
@@ -136,12 +137,27 @@ class Hierarchy {
   void fill_from_coarser(HierarchyField& f, int g);
   /// Grid g += interpolation of grid g+1, linear, and ghosts as fill_from_coarser. Ghosts of g+1 must be filled.
   void prolong_add(HierarchyField& f, int g);
+  /// The same for one component in cells whose share of the neighbour of its parent along axis a, the nearer one, is
+  /// component a of `shares` in place of 1/4.
+  void prolong_add_shared(HierarchyField& f, const HierarchyField& shares, int g);
   /// Parents in grid g+1 = means of grid g: of the cells, or of the faces that make up a face.
   void restrict_means(const HierarchyField& from, HierarchyField& to, int g);
   /// Parents in grid g+1 = means of grid g, faces weighted over both sides of the plane as well (full weighting).
   void restrict_weighted(const HierarchyField& from, HierarchyField& to, int g);
+  /// Faces of parents in grid g+1 as conductors: finer ones in series across the plane, side by side along it. Low planes of
+  /// leaves take means, as restrict_means. Ghosts of grid g must be filled.
+  void restrict_links(HierarchyField& f, int g);
+  /// Parents in grid g+1 = means of the cells that array(local node) holds, made when they are asked for, each once.
+  void restrict_made(const std::function<ArrayRef<const double>(int i)>& array, HierarchyField& to, int g);
+  /// Ghosts of leaves of grid g+1 beside nodes of grid g, such that the flux of y through the face between is the mean of
+  /// the fluxes of x through the finer faces; ghosts of x must be filled. Cells; kappa[a]: component of `coefficients` on
+  /// the faces along a, -1: constant.
+  void match_fluxes(const HierarchyField& x, HierarchyField& y, int g, const HierarchyField& coefficients, const Array<int>& kappa);
+  /// Whether grids from g on have leaves, on any rank.
+  bool leaves_from(int g) const { return g <= coarsest_leaf_; }
   /// Leaves have data: fills parents, then all ghosts, so that every leaf sees the composite solution round it.
-  void make_composite(HierarchyField& f, int depth, bool homogeneous);
+  /// `parents`: those beneath the coarsest leaves too.
+  void make_composite(HierarchyField& f, int depth, bool homogeneous, bool parents = true);
 
  private:
   // A box of ghosts in arrays of one layout, and where it comes from in the source's array.
@@ -170,7 +186,7 @@ class Hierarchy {
     std::vector<Message> messages;
   };
   struct Routes {
-    Route same, from_parent, ghosts_from_parent, to_parent, to_plane;
+    Route same, from_parent, ghosts_from_parent, to_parent, to_plane, to_border;
   };
   void add_level_grids();
   void add_grids_beneath();
@@ -193,6 +209,7 @@ class Hierarchy {
   const Mesh& mesh_;
   int rank_;
   int levels_ = 0;
+  int coarsest_leaf_ = 0;  // grid
   std::vector<Grid> grids_;
   std::vector<Routes> routes_;
   std::vector<Place> places_;

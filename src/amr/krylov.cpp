@@ -132,4 +132,121 @@ GmresResult Gmres::solve(Vector& x, const Pieces& pieces, const GmresOptions& o,
   }
 }
 
+GcrResult Gcr::solve(Vector& x, Vector& r, const Pieces& pieces, const GcrOptions& o, double norm, double largest) {
+  GcrResult result;
+  const std::size_t n = pieces.size(), slots = at(o.directions) + 1;
+  const int count_of_pieces = static_cast<int>(pieces.first.size()) - 1;
+  z_.resize(slots);
+  w_.resize(slots);
+  for (std::vector<Vector>* list : {&z_, &w_})
+    for (Vector& v : *list) v.resize(n);
+  std::vector<double> length(slots, 0.0);  // |w|^2
+  std::vector<double> partial, largest_of(at(count_of_pieces));
+  const auto measure = [&](const std::vector<double>& square) {
+    double most = 0;
+    for (const double m : largest_of) most = std::max(most, m);
+    result.residual = std::sqrt(square.front()) / std::max(norm, 1e-300);
+    result.largest = global_max(most, pieces.comm) / std::max(largest, 1e-300);
+    result.converged = result.residual <= o.tolerance && result.largest <= o.tolerance;
+  };
+  const auto sum_up = [&](std::size_t count) {
+    std::vector<ExactSum> sums(count);
+    for (int i = 0; i < count_of_pieces; ++i)
+      for (std::size_t k = 0; k < count; ++k) sums[k].add(partial[at(i) * count + k]);
+    return exact_sums(sums, pieces.comm);
+  };
+  partial.resize(at(count_of_pieces));
+  const auto norms_of_piece = [&](int i, std::size_t begin, std::size_t end) {
+    const double *v = r.data(), *weight = pieces.weight.data();
+    double sum = 0, most = 0;
+    if (pieces.alike) {
+#pragma omp simd reduction(+ : sum) reduction(max : most)
+      for (std::size_t q = begin; q < end; ++q) {
+        sum += v[q] * v[q];
+        most = std::max(most, std::abs(v[q]));
+      }
+      sum *= weight[begin];
+    } else {
+#pragma omp simd reduction(+ : sum) reduction(max : most)
+      for (std::size_t q = begin; q < end; ++q) {
+        sum += weight[q] * v[q] * v[q];
+        most = std::max(most, std::abs(v[q]));
+      }
+    }
+    partial[at(i)] = sum;
+    largest_of[at(i)] = most;
+  };
+  const auto for_pieces = [&](auto&& f) {
+    parallel_for(count_of_pieces, [&](int i) {
+      f(i, static_cast<std::size_t>(pieces.first[at(i)]), static_cast<std::size_t>(pieces.first[at(i) + 1]));
+    });
+  };
+  for_pieces(norms_of_piece);
+  measure(sum_up(1));
+  std::size_t known = 0, now = 0;  // directions to heed; the slot that the next one takes
+  while (!result.converged && result.iterations < o.max_iterations && std::isfinite(result.residual)) {
+    ++result.iterations;
+    precondition(r, z_[now]);
+    apply(z_[now], w_[now]);
+    std::vector<std::size_t> with;
+    for (std::size_t k = 1; k <= known; ++k) with.push_back((now + slots - k) % slots);
+    const std::size_t products = known + 2;
+    partial.resize(at(count_of_pieces) * products);
+    for_pieces([&](int i, std::size_t begin, std::size_t end) {
+      const double *w = w_[now].data(), *weight = pieces.weight.data();
+      const auto product = [&](const double* v) {
+        double sum = 0;
+        if (pieces.alike) {
+#pragma omp simd reduction(+ : sum)
+          for (std::size_t q = begin; q < end; ++q) sum += w[q] * v[q];
+          return sum * weight[begin];
+        }
+#pragma omp simd reduction(+ : sum)
+        for (std::size_t q = begin; q < end; ++q) sum += weight[q] * w[q] * v[q];
+        return sum;
+      };
+      double* p = partial.data() + at(i) * products;
+      *p++ = product(w);
+      *p++ = product(r.data());
+      for (const std::size_t j : with) *p++ = product(w_[j].data());
+    });
+    const std::vector<double> p = sum_up(products);
+    double square = p[0];
+    std::vector<double> along(with.size());
+    for (std::size_t k = 0; k < with.size(); ++k) {
+      along[k] = p[k + 2] / length[with[k]];
+      square -= along[k] * p[k + 2];
+    }
+    if (!(square > 1e-12 * p[0])) {  // nothing new: forget the rest
+      if (known == 0) break;
+      known = 0;
+      continue;
+    }
+    length[now] = square;
+    const double step = p[1] / square;  // r is orthogonal to the others already
+    partial.resize(at(count_of_pieces));
+    for_pieces([&](int i, std::size_t begin, std::size_t end) {
+      double *w = w_[now].data(), *z = z_[now].data(), *px = x.data(), *pr = r.data();
+      for (std::size_t k = 0; k < with.size(); ++k) {
+        const double *u = w_[with[k]].data(), *v = z_[with[k]].data(), a = along[k];
+#pragma omp simd
+        for (std::size_t q = begin; q < end; ++q) {
+          w[q] -= a * u[q];
+          z[q] -= a * v[q];
+        }
+      }
+#pragma omp simd
+      for (std::size_t q = begin; q < end; ++q) {
+        px[q] += step * z[q];
+        pr[q] -= step * w[q];
+      }
+      norms_of_piece(i, begin, end);
+    });
+    measure(sum_up(1));
+    known = std::min(known + 1, slots - 1);
+    now = (now + 1) % slots;
+  }
+  return result;
+}
+
 }  // namespace dendrift::amr

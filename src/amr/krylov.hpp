@@ -1,5 +1,5 @@
 /// \file
-/// GMRES with a preconditioner on the left, on vectors that are cut into pieces by blocks.
+/// Krylov methods on vectors that are cut into pieces by blocks.
 #pragma once
 
 #include <functional>
@@ -15,6 +15,7 @@ namespace dendrift::amr {
 struct Pieces {
   std::vector<std::ptrdiff_t> first{0};  ///< first[i] to first[i+1]: piece i
   std::vector<double> weight;            ///< of each entry in products, > 0
+  bool alike = false;                    ///< weights within a piece are all the same
   MPI_Comm comm = MPI_COMM_NULL;
 
   std::size_t size() const { return static_cast<std::size_t>(first.back()); }
@@ -49,6 +50,33 @@ class Gmres {
 
  private:
   std::vector<Vector> basis_;
+};
+
+struct GcrOptions {
+  double tolerance = 1e-10;  ///< of the residual over the right-hand side, in the 2-norm and in the largest entry
+  int max_iterations = 100;
+  int directions = 2;        ///< earlier ones that a new one is made orthogonal to; what is kept is two vectors each
+};
+
+struct GcrResult {
+  int iterations = 0;
+  double residual = 0, largest = 0;  ///< over those of the right-hand side, as carried along
+  bool converged = false;
+};
+
+/// Generalised conjugate residuals: as few vectors as one likes, for matrices nearly symmetric and preconditioners that
+/// may change. The residual carried along is that of K itself, not of the preconditioned system.
+class Gcr {
+ public:
+  using Vector = std::vector<double>;
+  std::function<void(const Vector& r, Vector& z)> precondition;  ///< z = about K^-1 r
+  std::function<void(const Vector& z, Vector& w)> apply;         ///< w = K z; called right after precondition
+
+  /// r: b - K x, brought up to date as x is. b is measured by `norm` and `largest`. Collective.
+  GcrResult solve(Vector& x, Vector& r, const Pieces& pieces, const GcrOptions& options, double norm, double largest);
+
+ private:
+  std::vector<Vector> z_, w_;
 };
 
 }  // namespace dendrift::amr

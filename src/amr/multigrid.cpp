@@ -61,6 +61,39 @@ void residual_sweep(Operator o, const double* x, const double* b, double* __rest
   for (std::ptrdiff_t q = begin; q < end; ++q) r[q] = b[q] - apply<K>(o, x, q);
 }
 
+// y = x + weight D^-1 (b - A x) + momentum (x - before), before: y - x of the step before this one, or x itself if that
+// began from zero; all of it as sweeps write it.
+template <int K>
+void second_step_from_zero(Operator o, const double* x, const double* b, const double* inverse, double* __restrict y,
+                           std::ptrdiff_t begin, std::ptrdiff_t end, double weight, double momentum) {
+#pragma omp simd
+  for (std::ptrdiff_t q = begin; q < end; ++q)
+    y[q] = (1 + momentum) * x[q] + weight * inverse[q] * (b[q] - apply<K>(o, x, q));
+}
+
+template <int K>
+void first_step(Operator o, const double* x, const double* b, const double* inverse, double* __restrict y,
+                std::ptrdiff_t begin, std::ptrdiff_t end, double weight) {
+#pragma omp simd
+  for (std::ptrdiff_t q = begin; q < end; ++q) y[q] = x[q] + weight * inverse[q] * (b[q] - apply<K>(o, x, q));
+}
+
+// x held what y started from.
+template <int K>
+void second_step(Operator o, const double* y, const double* b, const double* inverse, double* __restrict x,
+                 std::ptrdiff_t begin, std::ptrdiff_t end, double weight, double momentum) {
+#pragma omp simd
+  for (std::ptrdiff_t q = begin; q < end; ++q)
+    x[q] = y[q] + momentum * (y[q] - x[q]) + weight * inverse[q] * (b[q] - apply<K>(o, y, q));
+}
+
+Range grown(int n, int layers) { return {filled(-layers), filled(n + 2 * layers)}; }
+
+std::vector<Component> without_sides(std::vector<Component> components) {
+  for (Component& c : components) c.sides = {};
+  return components;
+}
+
 template <class F>
 void for_each_cell_of(const Range& box, F&& f) {
   for_each_cell(box.lo, box.size, f);
@@ -85,7 +118,7 @@ Multigrid::Multigrid(Hierarchy& hierarchy, std::vector<Component> components, co
                      MultigridOptions options)
     : h_(hierarchy), coefficients_(coefficients), options_(options),
       x_(hierarchy, components), rhs_(hierarchy, components), step_(hierarchy, components),
-      residual_(hierarchy, components), inverse_(hierarchy, components),
+      residual_(hierarchy, components), inverse_(hierarchy, options.in_pairs ? without_sides(components) : components),
       no_drag_(static_cast<std::size_t>(hierarchy.grid(0).layout.size()), 0.0) {}
 
 template <class F>
@@ -144,7 +177,46 @@ void Multigrid::prepare(std::vector<Links> links, const HierarchyField* drag) {
           });
         });
     });
+  // Ghosts as their own blocks have them; 0 where a coarser leaf lies, whose values no step may change.
+  if (options_.in_pairs) {
+    for (int g = 0; g < h_.grids(); ++g) h_.exchange(inverse_, g, Layout::GHOSTS);
+    prepare_shares();
+  }
   prepare_bottom();
+}
+
+// Between the centres of two coarse cells lie half a link within the one, the link through the face and half a link within
+// the other. What is linear in the resistance passed so far keeps the flux, whatever kappa does on the way.
+void Multigrid::prepare_shares() {
+  bool varies = false;
+  for (const Links::Along& l : links_[0].along) varies = varies || l.field >= 0;
+  if (!varies) {
+    shares_ = {};
+    return;
+  }
+  if (shares_.components() == 0) shares_ = HierarchyField(h_, std::vector<Component>(DIM));
+  for (int g = 0; g + 1 < h_.grids(); ++g)
+    parallel_for(h_.grid(g).size(), [&](int i) {
+      const Layout& layout = h_.grid(g).layout;
+      for (int a = 0; a < DIM; ++a) {
+        double* share = shares_.at(g, i, a);
+        const int field = links_[0].along[a].field;
+        const double* kappa = field < 0 ? nullptr : coefficients_.at(g, i, field);
+        const std::ptrdiff_t s = layout.stride(a);
+        for_each_cell({}, filled(layout.n), [&](const IntVec& q) {
+          const std::ptrdiff_t o = layout.offset(q);
+          if (kappa == nullptr) {
+            share[o] = 0.25;
+            return;
+          }
+          const bool upper = (q[a] & 1) != 0;
+          const double within = kappa[upper ? o : o + s], face = kappa[upper ? o + s : o];
+          double beyond = kappa[upper ? o + 2 * s : o - s];
+          if (beyond == 0) beyond = face;  // a coarser leaf's
+          share[o] = (0.25 / within) / (0.25 / within + 0.5 / face + 0.25 / beyond);
+        });
+      }
+    });
 }
 
 // f(place in the array, number) for the unknowns of the coarsest grid, all of which are rank 0's.
@@ -193,16 +265,32 @@ void Multigrid::prepare_bottom() {
       }
     });
   });
+  bottom_size_ = size;
+  if (options_.bottom == BottomSolver::hypre) {
+    std::vector<HypreSolver::Entry> list;
+    list.reserve(entries.size());
+    // The constant that nothing may fix gets a little, as the direct solver gives it.
+    for (const SparseSolver::Entry& e : entries)
+      list.push_back({e.row, e.column, e.row == e.column ? e.value * (1 + SparseSolver::LIFT) : e.value});
+    hypre_bottom_ = std::make_unique<HypreSolver>(MPI_COMM_SELF, 0, size, list, HypreSolver::Krylov::conjugate_gradients);
+    return;
+  }
   bottom_.factorize(size, entries);
 }
 
 void Multigrid::solve_bottom() {
   const int g = h_.grids() - 1;
   x_.clear(g);
-  bottom_values_.resize(at(bottom_.size()));
-  if (bottom_.size() == 0) return;
+  bottom_values_.resize(at(bottom_size_));
+  if (bottom_size_ == 0) return;
   for_bottom([&](int i, int c, std::ptrdiff_t q, int k) { bottom_values_[at(k)] = rhs_.at(g, i, c)[q]; });
-  bottom_.solve(bottom_values_);
+  if (hypre_bottom_ != nullptr) {
+    const std::vector<double> b = bottom_values_;
+    std::fill(bottom_values_.begin(), bottom_values_.end(), 0.0);
+    hypre_bottom_->solve(b, bottom_values_, 1e-13, 100);
+  } else {
+    bottom_.solve(bottom_values_);
+  }
   for_bottom([&](int i, int c, std::ptrdiff_t q, int k) { x_.at(g, i, c)[q] = bottom_values_[at(k)]; });
 }
 
@@ -303,8 +391,107 @@ void Multigrid::couple(int g) {
   });
 }
 
+Multigrid::Weights Multigrid::pair_weights() const {
+  const double hi = 2.0, lo = hi / options_.lowest, theta = 0.5 * (hi + lo), delta = 0.5 * (hi - lo), sigma = theta / delta;
+  const double rho = 1 / sigma, next = 1 / (2 * sigma - rho);
+  return {1 / theta, 2 * next / delta, next * rho};
+}
+
+// Two steps from zero and the means of what they leave, all from the right-hand side with two layers of ghosts.
+void Multigrid::descend_in_pairs(int g) {
+  const auto [first, second, momentum] = pair_weights();
+  const Layout& layout = h_.grid(g).layout;
+  h_.exchange(rhs_, g, Layout::GHOSTS);
+  const auto steps = [&, first = first, second = second, momentum = momentum](int i) {
+    thread_local std::vector<double> one_array, left_array;
+    one_array.resize(static_cast<std::size_t>(h_.grid(0).layout.size()));
+    left_array.resize(one_array.size());
+    double *one = one_array.data() + layout.interior(), *left = left_array.data() + layout.interior();
+    double* x = x_.at(g, i, 0);
+    const double *b = rhs_.at(g, i, 0), *inverse = inverse_.at(g, i, 0);
+    with_operator(x_, g, i, 0, [&](const Operator& o, auto kind) {
+      constexpr int K = decltype(kind)::value;
+      for_each_slab(layout, grown(layout.n, 2), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
+#pragma omp simd
+        for (std::ptrdiff_t q = begin; q < end; ++q) one[q] = first * inverse[q] * b[q];
+      });
+      for_each_slab(layout, grown(layout.n, 1), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
+        second_step_from_zero<K>(o, one, b, inverse, x, begin, end, second, momentum);
+      });
+      for_each_slab(layout, grown(layout.n, 0), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
+        residual_sweep<K>(o, x, b, left, begin, end);
+      });
+    });
+    return array_ref(static_cast<const double*>(left), layout);
+  };
+  h_.restrict_made(steps, rhs_, g);
+}
+
+void Multigrid::ascend_in_pairs(int g) {
+  const auto [first, second, momentum] = pair_weights();
+  const Layout& layout = h_.grid(g).layout;
+  h_.exchange(x_, g + 1, Layout::GHOSTS);
+  if (shares_.components() > 0) {
+    h_.prolong_add_shared(x_, shares_, g);
+  } else {
+    h_.prolong_add(x_, g);
+  }
+  h_.exchange(x_, g, Layout::GHOSTS);
+  parallel_for(h_.grid(g).size(), [&, first = first, second = second, momentum = momentum](int i) {
+    thread_local std::vector<double> one_array;
+    one_array.resize(static_cast<std::size_t>(h_.grid(0).layout.size()));
+    double *one = one_array.data() + layout.interior(), *x = x_.at(g, i, 0);
+    const double *b = rhs_.at(g, i, 0), *inverse = inverse_.at(g, i, 0);
+    with_operator(x_, g, i, 0, [&](const Operator& o, auto kind) {
+      constexpr int K = decltype(kind)::value;
+      for_each_slab(layout, grown(layout.n, 1), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
+        first_step<K>(o, x, b, inverse, one, begin, end, first);
+      });
+      for_each_slab(layout, grown(layout.n, 0), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
+        second_step<K>(o, one, b, inverse, x, begin, end, second, momentum);
+      });
+    });
+  });
+}
+
+// As couple, but what leaves a coarse leaf is what enters the finer nodes.
+void Multigrid::couple_in_pairs(int g) {
+  if (!h_.leaves_from(g + 1)) return;
+  Array<int> kappa{};
+  for (int a = 0; a < DIM; ++a) kappa[a] = links_[0].along[a].field;
+  h_.match_fluxes(x_, step_, g, coefficients_, kappa);
+  const Grid& coarse = h_.grid(g + 1);
+  parallel_for(coarse.size(), [&](int i) {
+    const Grid::Node& n = coarse.mine(i);
+    if (n.leaf < 0) return;
+    bool border = false;
+    for (int f = 0; f < FACES; ++f) {
+      const int m = n.neighbours[at(direction_index(face_offset(f)))];
+      border = border || (m >= 0 && coarse.nodes[at(m)].leaf < 0);
+    }
+    if (!border) return;
+    with_operator(step_, g + 1, i, 0, [&](const Operator& o, auto kind) {
+      const double* x = step_.at(g + 1, i, 0);
+      double* r = rhs_.at(g + 1, i, 0);
+      rows(g + 1, grown(coarse.layout.n, 0), [&](std::ptrdiff_t q0, int count) {
+#pragma omp simd
+        for (std::ptrdiff_t q = q0; q < q0 + count; ++q) r[q] -= apply<decltype(kind)::value>(o, x, q);
+      });
+    });
+  });
+}
+
 void Multigrid::cycle() {
   const int last = h_.grids() - 1;
+  if (options_.in_pairs) {
+    for (int g = 0; g < last; ++g) {
+      descend_in_pairs(g);
+      if (g + 1 < h_.levels()) couple_in_pairs(g);
+    }
+    solve_bottom();
+    for (int g = last - 1; g >= 0; --g) ascend_in_pairs(g);
+    return;
+  }
   for (int g = 0; g < last; ++g) {
     x_.clear(g);
     smooth(g, options_.smoothings, options_.lowest, true);

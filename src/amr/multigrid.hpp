@@ -3,9 +3,12 @@
 /// component with its own centring. Used as a preconditioner, so sides count as homogeneous.
 #pragma once
 
+#include <cstdint>
+#include <memory>
 #include <vector>
 
 #include "amr/hierarchy.hpp"
+#include "amr/hypre.hpp"
 #include "amr/sparse_solver.hpp"
 
 namespace dendrift::amr {
@@ -25,9 +28,16 @@ struct Links {
   bool coupled = false;
 };
 
+enum class BottomSolver : std::uint8_t { direct, hypre };
+
 struct MultigridOptions {
   int smoothings = 4;       ///< Chebyshev steps before and after the coarser grid
   double lowest = 8;        ///< they act on eigenvalues from 2/lowest to 2 of the diagonally scaled operator
+  BottomSolver bottom = BottomSolver::direct;
+  /// Two steps before and after whatever `smoothings` says, each pair on a block with two layers of ghosts, so that
+  /// memory is read once where steps and exchanges by themselves read it six times; and fluxes of corrections match where
+  /// levels meet. For one component in cells whose coefficients (of places below 0) have ghosts on all grids.
+  bool in_pairs = false;
 };
 
 class Multigrid {
@@ -46,8 +56,16 @@ class Multigrid {
 
  private:
   void smooth(int g, int steps, double lowest, bool from_zero);
+  struct Weights {
+    double first, second, momentum;
+  };
+  Weights pair_weights() const;
+  void descend_in_pairs(int g);
+  void ascend_in_pairs(int g);
+  void couple_in_pairs(int g);
   void residual(int g);
   void couple(int g);
+  void prepare_shares();
   void prepare_bottom();
   void solve_bottom();
   template <class F>
@@ -62,10 +80,13 @@ class Multigrid {
   const HierarchyField& coefficients_;
   std::vector<Links> links_;
   MultigridOptions options_;
-  HierarchyField x_, rhs_, step_, residual_, inverse_;
+  HierarchyField x_, rhs_, step_, residual_, inverse_;  // step_ in pairs: 0 but for ghosts beside finer nodes
+  HierarchyField shares_;  // in pairs, where a coefficient varies: see Hierarchy::prolong_add_shared
   const HierarchyField* drag_ = nullptr;
   std::vector<double> no_drag_;  // zeros for any block
   SparseSolver bottom_;
+  std::unique_ptr<HypreSolver> hypre_bottom_;
+  int bottom_size_ = 0;
   std::vector<double> bottom_values_;
 };
 

@@ -20,7 +20,6 @@ void SparseSolver::factorize(int size, const std::vector<Entry>& entries) {
   for (const Entry& e : entries) list.emplace_back(e.row, e.column, e.value);
   Eigen::SparseMatrix<double> matrix(size, size);
   matrix.setFromTriplets(list.begin(), list.end());
-  constexpr double LIFT = 1e-9;
   for (int i = 0; i < size; ++i) matrix.coeffRef(i, i) *= 1 + LIFT;
   if (factors_ == nullptr || size_ != size) {
     factors_ = std::make_unique<Factors>();

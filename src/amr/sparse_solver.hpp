@@ -17,6 +17,8 @@ class SparseSolver {
     double value;
   };
 
+  static constexpr double LIFT = 1e-9;
+
   SparseSolver();
   ~SparseSolver();
   SparseSolver(SparseSolver&&) noexcept;

@@ -1,6 +1,7 @@
 // Incremental pressure correction on the hierarchy: the cheap way of StokesSolver.
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
 #include "physics/stokes.hpp"
 
@@ -33,6 +34,113 @@ void StokesSolver::subtract_gradient(const HierarchyField& p, double factor, Hie
   });
 }
 
+void StokesSolver::cycle_momentum(HierarchyField& r) {
+  for_leaves([&](int, int g, int i, double) {
+    std::fill_n(pressure_.at(g, i, 0) - mesh_.layout().interior(), mesh_.layout().size(), 0.0);
+  });
+  cycle_velocity(r);
+}
+
+// Largest diagonal entry times v times the spacing of doubles.
+double StokesSolver::rounding_of_momentum() const {
+  double most = 0;
+  for (int b = 0; b < mesh_.size(); ++b) {
+    const auto [g, i] = hierarchy_.place_of_block(b);
+    const double *nu = viscosity_.at(g, i, 0), over = 4.0 * DIM / (mesh_.block(b).dx * mesh_.block(b).dx);
+    for (int a = 0; a < DIM; ++a) {
+      const double *v = state_.at(g, i, a), *kappa = drag_ != nullptr ? drag_->at(g, i, a) : nullptr;
+      amr::for_each_cell({}, filled(mesh_.layout().n), [&](const IntVec& q) {
+        const std::ptrdiff_t o = mesh_.layout().offset(q);
+        most = std::max(most, (sigma_ + over * nu[o] + (kappa != nullptr ? kappa[o] : 0.0)) * std::abs(v[o]));
+      });
+    }
+  }
+  return std::numeric_limits<double>::epsilon() * amr::global_max(most, mesh_.comm());
+}
+
+StokesResult StokesSolver::solve_momentum(double sigma) {
+  sigma_ = sigma;
+  velocity_cycle_->prepare(velocity_links(sigma), drag_.get());
+  // Vectors of velocities alone, piece by piece what pack() puts before the pressures.
+  const std::ptrdiff_t cells = volume(filled(mesh_.layout().n));
+  amr::Pieces pieces;
+  pieces.comm = mesh_.comm();
+  for (int b = 0; b < mesh_.size(); ++b) {
+    const auto begin = pieces_.weight.begin();
+    pieces.weight.insert(pieces.weight.end(), begin + pieces_.first[at(b)], begin + (pieces_.first[at(b) + 1] - cells));
+    pieces.first.push_back(static_cast<std::ptrdiff_t>(pieces.weight.size()));
+  }
+  pieces.alike = true;
+  const auto for_rows = [&](auto&& f) {
+    for_leaves([&](int b, int g, int i, double) {
+      std::ptrdiff_t place = pieces.first[at(b)];
+      for (int a = 0; a < DIM; ++a) {
+        const Range r = hierarchy_.unknowns(g, i, components_[at(a)], true);
+        amr::for_each_row(r.size, [&](const IntVec& row) {
+          f(g, i, a, mesh_.layout().offset(r.lo) + mesh_.layout().offset(row), place, r.size[0]);
+          place += r.size[0];
+        });
+      }
+    });
+  };
+  const auto take = [&](const HierarchyField& f, Vector& v) {
+    v.resize(pieces.size());
+    for_rows([&](int g, int i, int a, std::ptrdiff_t from, std::ptrdiff_t to, int count) {
+      std::copy_n(f.at(g, i, a) + from, count, v.data() + to);
+    });
+  };
+  const auto put = [&](const Vector& v, HierarchyField& f) {
+    for_rows([&](int g, int i, int a, std::ptrdiff_t to, std::ptrdiff_t from, int count) {
+      std::copy_n(v.data() + from, count, f.at(g, i, a) + to);
+    });
+  };
+  Vector zero;
+  pack(work_, zero);
+  std::fill(zero.begin(), zero.end(), 0.0);
+  unpack(zero, work_);  // its pressures
+  amr::Gcr gcr;
+  gcr.precondition = [&](const Vector& r, Vector& z) {
+    put(r, image_);
+    cycle_momentum(image_);
+    take(image_, z);
+  };
+  gcr.apply = [&](const Vector& z, Vector& w) {
+    put(z, work_);
+    hierarchy_.make_composite(work_, 1, true, false);
+    apply(work_, nullptr, image_);
+    take(image_, w);
+  };
+  const auto residual = [&](const Vector& of, Vector& left) {
+    put(of, state_);
+    hierarchy_.make_composite(state_, 1, false);
+    apply(state_, &force_, image_);
+    take(image_, left);
+  };
+  const auto largest = [&](const Vector& v) {
+    double most = 0;
+    for (const double q : v) most = std::max(most, std::abs(q));
+    return amr::global_max(most, mesh_.comm());
+  };
+  Vector x, r, b;
+  take(state_, x);
+  residual(Vector(x.size(), 0.0), b);  // what sides and pressure force as well
+  const double norm = std::max(pieces.norm(b), 1e-300), most = std::max(largest(b), 1e-300);
+  StokesResult result;
+  constexpr int PASSES = 3, DIRECTIONS_KEPT = 16;
+  for (int pass = 0; pass <= PASSES; ++pass) {
+    residual(x, r);
+    result.error = std::max(pieces.norm(r) / norm, largest(r) / most);
+    result.converged = result.error <= std::max(options_.tolerance, rounding_of_momentum() / most);
+    if (result.converged || pass == PASSES || result.iterations >= options_.max_iterations) break;
+    const amr::GcrOptions o{.tolerance = 0.95 * options_.tolerance,
+                            .max_iterations = options_.max_iterations - result.iterations,
+                            .directions = DIRECTIONS_KEPT};
+    result.iterations += gcr.solve(x, r, pieces, o, norm, most).iterations;
+  }
+  fill_state();
+  return result;
+}
+
 StokesResult StokesSolver::project(Vector& x) {
   momentum_.residual = [this](const Vector& now, Vector& r) {
     gmres_.residual(now, r);
@@ -44,10 +152,7 @@ StokesResult StokesSolver::project(Vector& x) {
   };
   momentum_.precondition = [this](Vector& r) {
     unpack(r, image_);
-    for_leaves([&](int, int g, int i, double) {
-      std::fill_n(pressure_.at(g, i, 0) - mesh_.layout().interior(), mesh_.layout().size(), 0.0);
-    });
-    cycle_velocity(image_);
+    cycle_momentum(image_);
     pack(image_, r);
     blank(r, true);
   };

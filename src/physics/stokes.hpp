@@ -67,6 +67,10 @@ class StokesSolver {
   /// What the last solution leaves of the momentum equation, on the unknown faces of the leaves. Faces that finer leaves
   /// own, and those of walls, hold nothing of use.
   const amr::HierarchyField& residual() const { return image_; }
+  /// The velocities alone, the pressure of state() held: sigma v - div[...] = f - grad p. Conjugate residuals round the
+  /// cycle of the coupled solver; tolerance and `error` are of the true residual over the right-hand side, in the 2-norm and
+  /// in the largest entry, or what the rounding of v leaves if that is more.
+  StokesResult solve_momentum(double sigma);
   /// Fills parents and ghosts of state(). Collective.
   void fill_state() { hierarchy_.make_composite(state_, amr::Layout::GHOSTS, false); }
 
@@ -79,6 +83,7 @@ class StokesSolver {
   void precondition(amr::HierarchyField& r);
   void cycle_pressure(amr::HierarchyField& r);
   void cycle_velocity(amr::HierarchyField& r);
+  void cycle_momentum(amr::HierarchyField& r);
   StokesResult project(Vector& x);
   void project_pass(Vector& x, StokesResult& result);
   void subtract_gradient(const amr::HierarchyField& p, double factor, amr::HierarchyField& v) const;
@@ -89,6 +94,7 @@ class StokesSolver {
   amr::Pieces plain_pieces() const;
   void pack(const amr::HierarchyField& f, Vector& v) const;
   void unpack(const Vector& v, amr::HierarchyField& f) const;
+  double rounding_of_momentum() const;
   template <class F>
   void for_leaves(F&& f) const {
     amr::parallel_for(mesh_.size(), [&](int b) {
