@@ -385,6 +385,26 @@ void Flow::store(double elapsed) {
     for (int a = 0; a < DIM; ++a) keep(state.at(g, i, a), mesh_->faces(v_, a, b), mesh_->faces(v_rate_, a, b));
     keep(state.at(g, i, StokesSolver::PRESSURE), mesh_->cells(pressure_, b), mesh_->cells(pressure_rate_, b));
   });
+  fill_rates();
+}
+
+// Ghosts of the rates, and their faces that belong to others: always from the same numbers, those that a checkpoint holds.
+void Flow::fill_rates() {
+  amr::HierarchyField& scratch = solver_->force();
+  const std::ptrdiff_t origin = mesh_->layout().interior(), size = mesh_->layout().size();
+  const auto each = [&](auto&& f) {
+    amr::parallel_for(mesh_->size(), [&](int b) {
+      const auto [g, i] = solver_->hierarchy().place_of_block(b);
+      for (int a = 0; a < DIM; ++a) f(mesh_->faces(v_rate_, a, b) - origin, scratch.at(g, i, a) - origin);
+      f(mesh_->cells(pressure_rate_, b) - origin, scratch.at(g, i, StokesSolver::PRESSURE) - origin);
+    });
+  };
+  each([&](double* rate, double* to) { std::copy_n(rate, size, to); });
+  solver_->hierarchy().make_composite(scratch, amr::Layout::GHOSTS, true);
+  each([&](double* rate, double* from) {
+    std::copy_n(from, size, rate);
+    std::fill_n(from, size, 0.0);  // nothing is to force the divergence
+  });
 }
 
 // The first guess: what the last change would lead to if it went on.

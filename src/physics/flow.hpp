@@ -119,6 +119,7 @@ class Flow : public Module {
   void load();
   double tolerance() const;
   void store(double elapsed);
+  void fill_rates();
   void extrapolate(double elapsed);
   void set_viscosity();
   bool penalised() const { return options_.solid == SolidModel::penalised || options_.motion == Motion::held; }
