@@ -465,6 +465,7 @@ def flow_steps():
     fine = ("flow.max_interval_tau0=0.5", "flow.max_change=0.005", "flow.courant=0.1", "flow.tolerance=1e-7")
     ways = {"reference": fine, "default": (), "tolerance 1e-4": ("flow.tolerance=1e-4",), "tolerance 1e-6": ("flow.tolerance=1e-6",),
             "max_change .02": ("flow.max_change=0.02",), "max_change .2": ("flow.max_change=0.2", "flow.max_interval_tau0=16"),
+            "coarser by a level": ("flow.coarser_levels=1",),
             "courant 1": ("flow.courant=1",), "courant 2": ("flow.courant=2",),
             "projection": ('flow.coupling="projection"',), "three projections": ('flow.coupling="projection"', "flow.projections=3"),
             "projection, steps a tenth": ('flow.coupling="projection"', "flow.max_change=0.005", "flow.max_interval_tau0=0.4"),

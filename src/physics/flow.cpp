@@ -69,6 +69,9 @@ void FlowOptions::declare(io::Schema& schema) {
   t.boolean("rotational", rotational).doc("the projection's pressure takes -nu div v as well");
   t.real("tolerance", tolerance).range(1e-12, 0.1).doc("preconditioned residual of a solution over the norm of the velocity; crystals err by some 30 times as much");
   t.integer("max_iterations", max_iterations).at_least(1).doc("of a solution; more is a numerical failure");
+  t.integer("coarser_levels", coarser_levels)
+      .range(0, 1)
+      .doc("1: velocity and pressure are found without the finest level of the mesh, and interpolated there");
   t.real("courant", courant).range(0.01, 10).doc("cells that the melt moves between two solutions at most");
   t.real("max_interval_tau0", max_interval_tau0).unit("tau0").above(0).doc("time between two solutions at most");
   t.real("max_change", max_change).range(1e-6, 10).doc("relative change of the velocity between two solutions aimed at");
@@ -261,7 +264,7 @@ void Flow::declare(amr::FieldTable& fields) {
   amr::FieldSpec v = velocity_field();
   v.transfer = amr::Transfer::conservative;
   v.checkpoint = true;
-  v_ = fields.add_face(v);
+  phase_.v = fields.add_face(v);
   amr::FieldSpec p;
   p.name = "pressure";
   p.symbol = "p";
@@ -269,39 +272,39 @@ void Flow::declare(amr::FieldTable& fields) {
   p.doc = "pressure over the density of the melt";
   p.transfer = amr::Transfer::conservative;
   p.checkpoint = true;
-  pressure_ = fields.add_cell(p);
+  phase_.pressure = fields.add_cell(p);
   v.name = "velocity_rate";
   v.symbol = "dv/dt";
   v.unit = "W0/tau0^2";
   v.doc = "change of the velocity in the last step of the flow: where the next one starts its search";
-  v_rate_ = fields.add_face(v);
+  phase_.v_rate = fields.add_face(v);
   p.name = "pressure_rate";
   p.symbol = "dp/dt";
   p.unit = "W0^2/tau0^3";
   p.doc = "the same of the pressure";
-  pressure_rate_ = fields.add_cell(p);
+  phase_.pressure_rate = fields.add_cell(p);
 }
 
 void Flow::attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) {
-  mesh_ = &mesh;
-  ghosts_ = &ghosts;
-  psi_ = {mesh.fields().find("psi").value()};
-  c_ = {mesh.fields().find("c").value()};
+  phase_mesh_ = mesh_ = &mesh;
+  phase_ghosts_ = &ghosts;
+  phase_.psi = {mesh.fields().find("psi").value()};
+  phase_.c = {mesh.fields().find("c").value()};
 }
 
 // A uniform velocity and v = curl of (U/k_y) sin(k_x x) sin(k_y y), as differences of what stands at edges: free of
 // divergence on every mesh.
 void Flow::initialize() {
-  const amr::Layout& layout = mesh_->layout();
-  const RealVec lo = mesh_->shape().lo, hi = mesh_->shape().hi();
+  const amr::Layout& layout = phase_mesh_->layout();
+  const RealVec lo = phase_mesh_->shape().lo, hi = phase_mesh_->shape().hi();
   const double kx = 2 * std::numbers::pi / (hi[0] - lo[0]), ky = 2 * std::numbers::pi / (hi[1] - lo[1]);
-  amr::parallel_for(mesh_->size(), [&](int b) {
-    const amr::Block& block = mesh_->block(b);
+  amr::parallel_for(phase_mesh_->size(), [&](int b) {
+    const amr::Block& block = phase_mesh_->block(b);
     const auto stream = [&](double x, double y) {
       return options_.initial_vortex_w0_tau0 / ky * std::sin(kx * (x - lo[0])) * std::sin(ky * (y - lo[1]));
     };
     for (int a = 0; a < DIM; ++a) {
-      double* v = mesh_->faces(v_, a, b);
+      double* v = phase_mesh_->faces(phase_.v, a, b);
       IntVec size = filled(layout.n);
       ++size[a];
       amr::for_each_cell({}, size, [&](const IntVec& q) {
@@ -316,16 +319,36 @@ void Flow::initialize() {
 }
 
 void Flow::after_regrid() {
-  solver_.reset();
-  const std::span<const amr::BlockIndex> leaves = mesh_->tree().leaves();
+  const std::span<const amr::BlockIndex> leaves = phase_mesh_->tree().leaves();
   if (!recalled_ && !std::ranges::equal(leaves, leaves_)) due_ = true;  // blocks that only changed their rank change nothing
   leaves_.assign(leaves.begin(), leaves.end());
   recalled_ = false;
-  // Faces that belong to others, and ghosts: neither a checkpoint nor a message holds them, and blocks to be refined need
-  // them.
-  load();
-  solver_->fill_state();
-  store(0);
+  solver_.reset();
+  choose_mesh();
+  make_solver();
+  // Neither a checkpoint nor a message holds ghosts, and blocks to be refined need them.
+  complete();
+}
+
+// Where to solve: on the mesh of the phase, or on the one without its finest level.
+void Flow::choose_mesh() {
+  mesh_ = phase_mesh_;
+  ghosts_ = phase_ghosts_;
+  now_ = phase_;
+  if (options_.coarser_levels == 0) return;
+  const amr::FieldTable& rows = phase_mesh_->fields();
+  amr::FieldTable table;
+  const auto cells = [&](amr::CellField f) { return table.add_cell(rows.row(f.id)); };
+  now_ = {cells(phase_.psi), cells(phase_.c), cells(phase_.pressure), cells(phase_.pressure_rate), {}, {}};
+  amr::FieldSpec faces;
+  for (const auto& [name, field] : {std::pair{"velocity", &now_.v}, std::pair{"velocity_rate", &now_.v_rate}}) {
+    faces.name = name;
+    *field = table.add_face(faces);
+  }
+  coarser_ = std::make_unique<amr::CoarserMesh>(*phase_mesh_, table);
+  mesh_ = &coarser_->mesh();
+  coarser_ghosts_ = std::make_unique<amr::GhostExchange>(*mesh_);
+  ghosts_ = coarser_ghosts_.get();
 }
 
 std::vector<double> Flow::memory() const { return {last_, next_, interval_, fastest_, due_ ? 1.0 : 0.0}; }
@@ -339,27 +362,37 @@ void Flow::recall(const std::vector<double>& m) {
   recalled_ = true;
 }
 
-void Flow::load() {
-  if (solver_ == nullptr) {
-    StokesOptions o;
-    o.stress = penalised() ? Stress::laplacian : options_.stress;  // the same where the viscosity is uniform
-    o.tolerance = tolerance();
-    o.max_iterations = options_.max_iterations;
-    o.coupling = options_.coupling;
-    o.passes = options_.projections;
-    o.rotational = options_.rotational;
-    solver_ = std::make_unique<StokesSolver>(*mesh_, o);
-    for (int f = 0; f < FACES; ++f)
-      for (int a = 0; a < DIM && mesh_->shape().sides[at(f)] == amr::Side::wall; ++a)
-        solver_->set_wall_velocity(a, f, options_.wall_value(mesh_->shape(), a, f));
-  }
-  amr::HierarchyField& state = solver_->state();
+// f(grid, node, component, values, rates): for the arrays of velocity and pressure of every block, from their first ghost on.
+template <class F>
+void Flow::for_arrays(F&& f) {
+  const std::ptrdiff_t origin = mesh_->layout().interior();
   amr::parallel_for(mesh_->size(), [&](int b) {
     const auto [g, i] = solver_->hierarchy().place_of_block(b);
-    const std::ptrdiff_t origin = mesh_->layout().interior(), size = mesh_->layout().size();
-    for (int a = 0; a < DIM; ++a) std::copy_n(mesh_->faces(v_, a, b) - origin, size, state.at(g, i, a) - origin);
-    std::copy_n(mesh_->cells(pressure_, b) - origin, size, state.at(g, i, StokesSolver::PRESSURE) - origin);
+    for (int a = 0; a < DIM; ++a) f(g, i, a, mesh_->faces(now_.v, a, b) - origin, mesh_->faces(now_.v_rate, a, b) - origin);
+    f(g, i, StokesSolver::PRESSURE, mesh_->cells(now_.pressure, b) - origin, mesh_->cells(now_.pressure_rate, b) - origin);
   });
+}
+
+void Flow::make_solver() {
+  StokesOptions o;
+  o.stress = penalised() ? Stress::laplacian : options_.stress;  // the same where the viscosity is uniform
+  o.tolerance = tolerance();
+  o.max_iterations = options_.max_iterations;
+  o.coupling = options_.coupling;
+  o.passes = options_.projections;
+  o.rotational = options_.rotational;
+  solver_ = std::make_unique<StokesSolver>(*mesh_, o);
+  for (int f = 0; f < FACES; ++f)
+    for (int a = 0; a < DIM && mesh_->shape().sides[at(f)] == amr::Side::wall; ++a)
+      solver_->set_wall_velocity(a, f, options_.wall_value(mesh_->shape(), a, f));
+}
+
+void Flow::load() {
+  const std::ptrdiff_t origin = mesh_->layout().interior(), size = mesh_->layout().size();
+  for_arrays([&](int g, int i, int c, const double* value, const double*) {
+    std::copy_n(value, size, solver_->state().at(g, i, c) - origin);
+  });
+  solver_->fill_state();
 }
 
 // The same residual hides an error of a crystal's velocity that grows with the ratio of the viscosities: .1 % at 1e6, 2 %
@@ -370,61 +403,52 @@ double Flow::tolerance() const {
   return penalised() ? options_.tolerance : std::max(tightened, std::min(options_.tolerance, FINEST));
 }
 
-// Keeps the solution, and how fast it has changed since the last one.
+// Keeps the solution, and how fast it has changed since the last one; elapsed 0: leaves the rates as they are.
 void Flow::store(double elapsed) {
-  const amr::HierarchyField& state = solver_->state();
   const std::ptrdiff_t origin = mesh_->layout().interior(), size = mesh_->layout().size();
-  amr::parallel_for(mesh_->size(), [&](int b) {
-    const auto [g, i] = solver_->hierarchy().place_of_block(b);
-    const auto keep = [&](const double* now, double* old, double* rate) {
-      for (std::ptrdiff_t q = -origin; q < size - origin; ++q) {
-        if (elapsed > 0) rate[q] = (now[q] - old[q]) / elapsed;
-        old[q] = now[q];
-      }
-    };
-    for (int a = 0; a < DIM; ++a) keep(state.at(g, i, a), mesh_->faces(v_, a, b), mesh_->faces(v_rate_, a, b));
-    keep(state.at(g, i, StokesSolver::PRESSURE), mesh_->cells(pressure_, b), mesh_->cells(pressure_rate_, b));
+  for_arrays([&](int g, int i, int c, double* value, double* rate) {
+    const double* now = solver_->state().at(g, i, c) - origin;
+    for (std::ptrdiff_t q = 0; q < size; ++q) {
+      if (elapsed > 0) rate[q] = (now[q] - value[q]) / elapsed;
+      value[q] = now[q];
+    }
   });
-  fill_rates();
 }
 
-// Ghosts of the rates, and their faces that belong to others: always from the same numbers, those that a checkpoint holds.
-void Flow::fill_rates() {
+// Ghosts of velocity, pressure and their rates, and faces that belong to others: always from the same numbers, those that a
+// checkpoint holds.
+void Flow::complete() {
+  const amr::FieldList all{{now_.pressure, now_.pressure_rate}, {now_.v, now_.v_rate}};
+  if (coarser_ != nullptr) coarser_->take(all);
+  load();
+  store(0);
   amr::HierarchyField& scratch = solver_->force();
   const std::ptrdiff_t origin = mesh_->layout().interior(), size = mesh_->layout().size();
-  const auto each = [&](auto&& f) {
-    amr::parallel_for(mesh_->size(), [&](int b) {
-      const auto [g, i] = solver_->hierarchy().place_of_block(b);
-      for (int a = 0; a < DIM; ++a) f(mesh_->faces(v_rate_, a, b) - origin, scratch.at(g, i, a) - origin);
-      f(mesh_->cells(pressure_rate_, b) - origin, scratch.at(g, i, StokesSolver::PRESSURE) - origin);
-    });
-  };
-  each([&](double* rate, double* to) { std::copy_n(rate, size, to); });
+  for_arrays([&](int g, int i, int c, const double*, const double* rate) {
+    std::copy_n(rate, size, scratch.at(g, i, c) - origin);
+  });
   solver_->hierarchy().make_composite(scratch, amr::Layout::GHOSTS, true);
-  each([&](double* rate, double* from) {
+  for_arrays([&](int g, int i, int c, const double*, double* rate) {
+    double* from = scratch.at(g, i, c) - origin;
     std::copy_n(from, size, rate);
     std::fill_n(from, size, 0.0);  // nothing is to force the divergence
   });
+  if (coarser_ != nullptr) coarser_->give_common(all);
 }
 
 // The first guess: what the last change would lead to if it went on.
 void Flow::extrapolate(double elapsed) {
-  amr::HierarchyField& state = solver_->state();
   const std::ptrdiff_t origin = mesh_->layout().interior(), size = mesh_->layout().size();
-  amr::parallel_for(mesh_->size(), [&](int b) {
-    const auto [g, i] = solver_->hierarchy().place_of_block(b);
-    const auto advance = [&](double* x, const double* rate) {
-      for (std::ptrdiff_t q = -origin; q < size - origin; ++q) x[q] += elapsed * rate[q];
-    };
-    for (int a = 0; a < DIM; ++a) advance(state.at(g, i, a), mesh_->faces(v_rate_, a, b));
-    advance(state.at(g, i, StokesSolver::PRESSURE), mesh_->cells(pressure_rate_, b));
+  for_arrays([&](int g, int i, int c, const double*, const double* rate) {
+    double* x = solver_->state().at(g, i, c) - origin;
+    for (std::ptrdiff_t q = 0; q < size; ++q) x[q] += elapsed * rate[q];
   });
 }
 
 void Flow::set_viscosity() {
   const amr::Layout& layout = mesh_->layout();
   const auto phase = [&](int b, double* phi) {
-    const double* psi = mesh_->cells(psi_, b) - layout.interior();
+    const double* psi = mesh_->cells(now_.psi, b) - layout.interior();
     double* out = phi - layout.interior();
     for (std::ptrdiff_t q = 0; q < layout.size(); ++q) out[q] = phi_of_psi(psi[q]);
   };
@@ -446,7 +470,7 @@ void Flow::set_force(double sigma) {
     thread_local std::vector<double> heavy_array;
     heavy_array.resize(static_cast<std::size_t>(layout.size()));
     double* heavy = heavy_array.data() + layout.interior();
-    const double *psi = mesh_->cells(psi_, b), *c = mesh_->cells(c_, b);
+    const double *psi = mesh_->cells(now_.psi, b), *c = mesh_->cells(now_.c, b);
     for (std::ptrdiff_t q = -layout.interior(); q < layout.size() - layout.interior(); ++q) {
       const double phi = phi_of_psi(psi[q]);
       const double liquid = options_.buoyancy == Buoyancy::mixture ? c[q] : 1 + (1 - scales_.k) * u_of_c(c[q], phi, scales_.k);
@@ -554,7 +578,7 @@ void Flow::shift(amr::HierarchyField& f, const RealVec& by, const Array<bool>& a
 // logarithm) or a sphere would have at the largest speed. Free crystals only.
 double Flow::unbalanced() const {
   if (options_.motion == Motion::held || !(fastest_ > 0)) return 0;
-  const std::vector<RealVec> forces = net_forces(*mesh_, psi_, crystals_, [&](int b, int axis) {
+  const std::vector<RealVec> forces = net_forces(*mesh_, now_.psi, crystals_, [&](int b, int axis) {
     const auto [g, i] = solver_->hierarchy().place_of_block(b);
     return solver_->residual().at(g, i, axis);
   });
@@ -569,9 +593,9 @@ double Flow::unbalanced() const {
 }
 
 void Flow::solve(double elapsed) {
-  ghosts_->fill({psi_, c_});
+  if (coarser_ != nullptr) coarser_->take({{now_.psi, now_.c}, {}});
+  ghosts_->fill({now_.psi, now_.c});
   load();
-  solver_->fill_state();
   set_viscosity();
   const double sigma = 1 / elapsed;
   set_force(sigma);
@@ -602,7 +626,7 @@ void Flow::solve(double elapsed) {
     for (int a = 0; a < DIM; ++a)
       amr::for_each_cell({}, filled(mesh_->layout().n), [&](const IntVec& q) {
         const double v = solver_->state().at(g, i, a)[mesh_->layout().offset(q)];
-        change = std::max(change, std::abs(v - mesh_->faces(v_, a, b)[mesh_->layout().offset(q)]));
+        change = std::max(change, std::abs(v - mesh_->faces(now_.v, a, b)[mesh_->layout().offset(q)]));
         fastest = std::max(fastest, std::abs(v));
       });
   }
@@ -610,31 +634,33 @@ void Flow::solve(double elapsed) {
   fastest_ = amr::global_max(fastest, mesh_->comm());
   unbalanced_ = unbalanced();
   store(elapsed);
+  if (coarser_ != nullptr) coarser_->give({{now_.pressure, now_.pressure_rate}, {now_.v, now_.v_rate}});
+  complete();
   // The interval after which the velocity will have changed as much as wanted, at the rate seen now.
   const double wanted = change > 0 ? elapsed * options_.max_change * fastest_ / change : options_.max_interval_tau0;
-  const double dx = mesh_->shape().dx(mesh_->shape().max_level);
+  const double dx = phase_mesh_->shape().dx(phase_mesh_->shape().max_level);
   interval_ = std::min({options_.max_interval_tau0, options_.courant * dx / std::max(fastest_, 1e-300),
                         std::max(wanted, 0.5 * interval_), interval_ > 0 ? 2 * interval_ : 1e300});
 }
 
 // Inertia is explicit, and crystals move at the end of a step as they did at its start.
 double Flow::max_dt() const {
-  return options_.courant * mesh_->shape().dx(mesh_->shape().max_level) / std::max(fastest_, 1e-300);
+  return options_.courant * phase_mesh_->shape().dx(phase_mesh_->shape().max_level) / std::max(fastest_, 1e-300);
 }
 
 void Flow::advance(double t, double dt, std::int64_t) {
   // At rest at the start, unless walls push melt in: it must go somewhere from the first step on.
-  const double elapsed = t > last_ ? t - last_ : t == 0 && options_.through_walls(mesh_->shape()) ? dt : 0;
+  const double elapsed = t > last_ ? t - last_ : t == 0 && options_.through_walls(phase_mesh_->shape()) ? dt : 0;
   if (elapsed <= 0) return;
   if (!due_ && t < next_ * (1 - 1e-12)) return;
   solve(elapsed);
   // The step was chosen for the velocity before.
   constexpr double MOST_CELLS = 10;
-  const double cells = fastest_ * dt / mesh_->shape().dx(mesh_->shape().max_level);
+  const double cells = fastest_ * dt / phase_mesh_->shape().dx(phase_mesh_->shape().max_level);
   if (cells > MOST_CELLS * std::max(1.0, options_.courant))
     throw NumericalError(fmt::format("the flow has become too fast for the step: {:.3g} cells in {:.3g} tau0; a smaller "
                                      "phase_field.max_dt_tau0 may help", cells, dt));
-  measure_motion(*mesh_, psi_, options_.motion == Motion::held ? amr::FaceField{} : v_, crystals_);
+  measure_motion(*phase_mesh_, phase_.psi, options_.motion == Motion::held ? amr::FaceField{} : phase_.v, crystals_);
   last_ = t;
   next_ = t + interval_;
   due_ = false;

@@ -5,6 +5,7 @@
 #include <memory>
 #include <optional>
 
+#include "amr/coarser_mesh.hpp"
 #include "io/config.hpp"
 #include "physics/module.hpp"
 #include "physics/scales.hpp"
@@ -49,6 +50,7 @@ struct FlowOptions {
   bool rotational = true;
   double tolerance = 1e-5;
   int max_iterations = 300;
+  int coarser_levels = 0;
   double courant = 0.5, max_interval_tau0 = 4, max_change = 0.05;
   std::array<std::optional<RealVec>, 6> wall_velocity_w0_tau0;  ///< those of z are read in 3D only
   std::array<Profile, 6> wall_profile{};
@@ -116,10 +118,14 @@ class Flow : public Module {
 
  private:
   void solve(double elapsed);
+  void choose_mesh();
+  void make_solver();
+  template <class F>
+  void for_arrays(F&& f);
   void load();
   double tolerance() const;
   void store(double elapsed);
-  void fill_rates();
+  void complete();
   void extrapolate(double elapsed);
   void set_viscosity();
   bool penalised() const { return options_.solid == SolidModel::penalised || options_.motion == Motion::held; }
@@ -135,10 +141,15 @@ class Flow : public Module {
   std::vector<Seed>& crystals_;
   double solutal_, weight_;  // alpha_c c_l and rho_s/rho_l - 1, times the switches
   RealVec gravity_{};  // W0/tau0^2
-  amr::CellField psi_, c_, pressure_, pressure_rate_;
-  amr::FaceField v_, v_rate_;
-  amr::Mesh* mesh_ = nullptr;
-  amr::GhostExchange* ghosts_ = nullptr;
+  struct Fields {
+    amr::CellField psi, c, pressure, pressure_rate;
+    amr::FaceField v, v_rate;
+  };
+  Fields phase_, now_;  // on the mesh of the phase, and on that of the solver
+  amr::Mesh *phase_mesh_ = nullptr, *mesh_ = nullptr;
+  amr::GhostExchange *phase_ghosts_ = nullptr, *ghosts_ = nullptr;
+  std::unique_ptr<amr::CoarserMesh> coarser_;  // where mesh_ is not that of the phase
+  std::unique_ptr<amr::GhostExchange> coarser_ghosts_;
   std::unique_ptr<StokesSolver> solver_;
   std::vector<amr::BlockIndex> leaves_;  // of the tree that the velocity belongs to
   double last_ = 0, next_ = 0, interval_ = 0;

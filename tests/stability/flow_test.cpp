@@ -441,6 +441,23 @@ TEST(HardFlow, FallsOntoTheFloor) {
   }
 }
 
+// The flow without the finest level of the mesh: the same fall, from a velocity that is free of divergence on all levels.
+TEST(HardFlow, OnACoarserMesh) {
+  std::array<double, 2> fallen{}, speeds{};
+  for (const int levels : {0, 1}) {
+    Scene scene(rigid_scene(place(64, 64), seed(place(32, 40), 8)),
+                {"flow.gravity_um_s2=1e8", viscosity(5), "phase_field.rigid=false", fmt::format("flow.coarser_levels={}", levels)});
+    follow(scene, DIM == 2 ? 10 : 2, fmt::format("{} levels coarser", levels), {60, 2e-4});
+    EXPECT_GE(scene->mesh().tree().finest_level(), 2);
+    fallen[static_cast<std::size_t>(levels)] = 40 - scene->crystals()[0].position[DIM - 1];
+    speeds[static_cast<std::size_t>(levels)] = speed(scene);
+  }
+  EXPECT_GT(fallen[0], DIM == 2 ? 2 : 0.1);
+  EXPECT_NEAR(fallen[1] / fallen[0], 1, 0.02);
+  EXPECT_NEAR(speeds[1] / speeds[0], 1, 0.02);
+  EXPECT_NE(fallen[1], fallen[0]);  // something was left out
+}
+
 TEST(HardFlow, Reynolds) {
   for (const double re : {1.0, 100.0, 1000.0}) {
     const std::string what = fmt::format("cavity, Re {}", re);
