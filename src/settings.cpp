@@ -123,6 +123,7 @@ Settings::Settings() {
   physics::SeedOptions::declare(schema, seed);
   phase_field.declare(schema);
   solute.declare(schema);
+  orientation.declare(schema);
   flow.declare(schema);
   parallel.declare(schema);
   output.declare(schema);

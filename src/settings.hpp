@@ -10,6 +10,7 @@
 #include "amr/partition.hpp"
 #include "io/config.hpp"
 #include "physics/flow.hpp"
+#include "physics/orientation.hpp"
 #include "physics/phase_field.hpp"
 #include "physics/scales.hpp"
 #include "physics/seeds.hpp"
@@ -76,6 +77,7 @@ class Settings {
   physics::AlloyOptions alloy;
   physics::PhaseFieldOptions phase_field;
   physics::SoluteOptions solute;
+  physics::OrientationOptions orientation;
   physics::FlowOptions flow;
   std::vector<physics::SeedOptions> seed;
   io::Schema schema;

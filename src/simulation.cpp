@@ -502,6 +502,14 @@ void Simulation::write_plotfile() {
       });
     };
   };
+  const auto own_alpha = mesh_->fields().find("alpha"), own_grain = mesh_->fields().find("grain");
+  const auto of_field = [this, &layout](int id) {
+    return [this, &layout, id](int b, std::span<double> out) {
+      const double* values = mesh_->cells({id}, b);
+      std::size_t i = 0;
+      amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) { out[i++] = values[layout.offset(cell)]; });
+    };
+  };
   const double angle = crystals_.empty() ? 0 : std::atan2(crystals_[0].axes[0][1], crystals_[0].axes[0][0]);
   std::vector<PlotComponent> fields{
       {"phi", of_state([](int, double phi, double) { return phi; })},
@@ -509,6 +517,7 @@ void Simulation::write_plotfile() {
       {"c", of_state([&s](int, double, double c) { return c * s.c_l_wt; })},
       {"alpha", of_state([angle](int, double, double) { return angle; })},
   };
+  if (own_alpha) fields.back().values = of_field(*own_alpha);
   const auto zero = of_state([](int, double, double) { return 0.0; });
   const auto velocity = mesh_->fields().find("velocity_x"), pressure = mesh_->fields().find("pressure");
   for (int a = 0; a < DIM; ++a) {
@@ -533,6 +542,15 @@ void Simulation::write_plotfile() {
   fields.push_back({"level", of_state([this](int b, double, double) { return double(mesh_->block(b).index.level); })});
   fields.push_back({"rank", of_state([this](int, double, double) { return double(mesh_->rank()); })});
   fields.push_back({"grain", of_state([](int, double phi, double) { return phi > 0 ? 0.0 : -1.0; })});
+  if (own_grain)
+    fields.back().values = [this, &layout, own_grain](int b, std::span<double> out) {
+      const double *grain = mesh_->cells({*own_grain}, b), *psi = mesh_->cells(psi_, b);
+      std::size_t i = 0;
+      amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
+        const std::ptrdiff_t q = layout.offset(cell);
+        out[i++] = psi[q] > 0 ? grain[q] : -1.0;
+      });
+    };
   const std::string name = fmt::format("plt_{:07d}.hdf", step_);
   write_plot(path(name), *mesh_, s, time_ * s.tau0_s, step_, fields);
   io::SharedFailure failure;

@@ -83,6 +83,7 @@ class Simulation {
   std::vector<physics::Tip> tips();
   physics::Report report() const;
   const std::vector<physics::Seed>& crystals() const { return crystals_; }
+  std::vector<physics::Seed>& crystals() { return crystals_; }
   double solute_drift(const Totals& t) const { return (t.solute_mean - initial_solute_) / initial_solute_; }
   double max_dt() const;
   void write_checkpoint(const std::string& path);

@@ -16,7 +16,14 @@ enum class Centring : std::uint8_t { cell, face };
 /// What regridding does to the data of a field.
 enum class Transfer : std::uint8_t {
   none,          ///< not kept: scratch, or recomputed by its module after every change of the mesh
-  conservative,  ///< third-order prolongation that keeps the mean, restriction by the mean
+  conservative,  ///< kept; between levels as `mixing` says
+};
+
+/// How values pass between levels, for ghost cells and for new blocks alike.
+enum class Mixing : std::uint8_t {
+  means,   ///< third-order interpolation, and the mean of the children
+  angles,  ///< values equal modulo FieldSpec::period: differences are wrapped; linear between neighbours, no new extremes
+  labels,  ///< never mixed: children take the value of their parent, a parent that of its first child
 };
 
 /// Rule for ghost cells beyond a side of the domain that is not periodic.
@@ -35,6 +42,8 @@ struct FieldSpec {
   Centring centring = Centring::cell;
   int normal = -1;       ///< of the faces, where they carry the field
   Transfer transfer = Transfer::none;
+  Mixing mixing = Mixing::means;
+  double period = 0;     ///< of angles
   bool checkpoint = false;
   std::array<SideRule, FACES> sides{};
 };

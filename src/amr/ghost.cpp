@@ -218,7 +218,7 @@ void GhostExchange::run_copy(const Copy& c, CellField f, std::size_t field, Arra
   const Mesh& mesh = mesh_;
   const ArrayRef<const double> src = array_ref(mesh.array(f.id, c.slot), mesh.layout());
   if (c.restricts) {
-    restrict_box(dst, c.dst_lo, src, c.src_lo, c.size);
+    restrict_cells(mesh.fields().row(f.id), dst, c.dst_lo, src, c.src_lo, c.size);
   } else {
     copy_box(dst, c.dst_lo, src, c.src_lo, c.size);
   }
@@ -252,8 +252,9 @@ void GhostExchange::fill_coarse_and_prolong(const Plan& plan, CellField field, i
   const int n = mesh_.layout().n;
   const ArrayRef<double> block = array_ref(mesh_.cells(field, b), mesh_.layout());
   const ArrayRef<double> c = coarse_ref(coarse);
-  restrict_box(c, {}, {block.p, block.stride}, {}, filled(n / 2));
-  apply_sides(plan.outside, mesh_.fields().row(field.id), c, n / 2, COARSE_GHOSTS);
+  const FieldSpec& spec = mesh_.fields().row(field.id);
+  restrict_cells(spec, c, {}, {block.p, block.stride}, {}, filled(n / 2));
+  apply_sides(plan.outside, spec, c, n / 2, COARSE_GHOSTS);
   for (int d = 0; d < DIRECTIONS; ++d) {
     if ((plan.coarser & (1U << d)) == 0) continue;
     const IntVec o = direction_offset(d);
@@ -262,7 +263,7 @@ void GhostExchange::fill_coarse_and_prolong(const Plan& plan, CellField field, i
       lo[a] = o[a] < 0 ? -G : o[a] > 0 ? n : 0;
       size[a] = o[a] == 0 ? n : G;
     }
-    prolong_box(block, lo, {c.p, c.stride}, size);
+    prolong_cells(spec, block, lo, {c.p, c.stride}, size);
   }
 }
 

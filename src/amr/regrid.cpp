@@ -99,7 +99,7 @@ class Rebuilder {
     const ArrayRef<double> s = ref(field, slot);
     const IntVec half = filled(mesh_.layout().n / 2);
     if (normal(field) < 0) {
-      restrict_box(dst, lo, {s.p, s.stride}, {}, half);
+      restrict_cells(mesh_.fields().row(field), dst, lo, {s.p, s.stride}, {}, half);
     } else {
       restrict_faces(dst, lo, {s.p, s.stride}, half, normal(field));
     }
@@ -120,7 +120,8 @@ class Rebuilder {
     for (int a = 0; a < DIM; ++a) corner[a] = place[a] * n / 2;
     for (const int f : fields_) {
       const ArrayRef<double> p = ref(f, parent);
-      if (normal(f) < 0) prolong_box(ref(f, slot), {}, {p.at(corner), p.stride}, filled(n));
+      if (normal(f) < 0)
+        prolong_cells(mesh_.fields().row(f), ref(f, slot), {}, {p.at(corner), p.stride}, filled(n));
       if (normal(f) != 0) continue;
       Array<ArrayRef<double>> fine{};
       Array<ArrayRef<const double>> coarse{};

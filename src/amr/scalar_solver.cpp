@@ -49,11 +49,17 @@ void residual_row(Coefficients k, const double* x, const double* b, int n, doubl
   for (int q = 0; q < n; ++q) y[q] = b[q] - stencil<VARIABLE>(k, x, q);
 }
 
+// y += sign extra x
+void add_extra_row(const double* extra, const double* x, int n, double sign, double* __restrict y) {
+#pragma omp simd
+  for (int q = 0; q < n; ++q) y[q] += sign * extra[q] * x[q];
+}
+
 }  // namespace
 
 ScalarSolver::ScalarSolver(const Mesh& mesh, const std::array<MirrorRule, FACES>& sides, const ScalarOptions& options)
     : options_(options), mesh_(mesh), hierarchy_(mesh), state_(hierarchy_, {Component{-1, sides}}),
-      rhs_(hierarchy_, {Component{-1, sides}}), beta_(hierarchy_, faces_of_all_axes()),
+      rhs_(hierarchy_, {Component{-1, sides}}), beta_(hierarchy_, faces_of_all_axes()), extra_(hierarchy_, {Component{}}),
       cycle_(hierarchy_, {Component{-1, sides}}, beta_, options.cycle) {
   if (options.method == ScalarMethod::hypre && !HypreSolver::available()) throw std::runtime_error("this build has no hypre");
   volumes_.comm = mesh.comm();
@@ -80,10 +86,25 @@ void ScalarSolver::prepare(double sigma, double beta) {
     kappa_[a] = -1;
   }
   factor_ = beta;
+  with_extra_ = false;
   prepare_links(sigma, links);
 }
 
 void ScalarSolver::prepare(double sigma) {
+  with_extra_ = false;
+  prepare_beta(sigma);
+}
+
+void ScalarSolver::prepare_with_extra(double sigma) {
+  with_extra_ = true;
+  for (int g = 0; g < hierarchy_.grids(); ++g) {
+    hierarchy_.exchange(extra_, g, Layout::GHOSTS);
+    if (g + 1 < hierarchy_.grids()) hierarchy_.restrict_means(extra_, extra_, g);
+  }
+  prepare_beta(sigma);
+}
+
+void ScalarSolver::prepare_beta(double sigma) {
   spread_beta();
   Links links;
   for (int a = 0; a < DIM; ++a) links.along[a].field = kappa_[a] = a;
@@ -93,12 +114,12 @@ void ScalarSolver::prepare(double sigma) {
 
 void ScalarSolver::prepare_links(double sigma, const Links& links) {
   sigma_ = sigma;
-  floating_ = sigma == 0;
+  floating_ = sigma == 0 && !with_extra_;
   for (int f = 0; f < FACES; ++f)
     if (mesh_.shape().sides[at(f)] != Side::periodic && state_.component(0).sides[at(f)].odd) floating_ = false;
   Links all = links;
   all.sigma = sigma;
-  cycle_.prepare({all});
+  cycle_.prepare({all}, with_extra_ ? &extra_ : nullptr);
   weigh();
   if (options_.method == ScalarMethod::hypre) assemble();
 }
@@ -117,7 +138,7 @@ void ScalarSolver::weigh() {
       const std::ptrdiff_t o = layout.offset(q);
       double links = 0;
       for (int a = 0; a < DIM; ++a) links += beta_.at(g, i, a)[o] + beta_.at(g, i, a)[o + layout.stride(a)];
-      *w++ /= sigma_ + over * links;
+      *w++ /= zeroth(g, i, o) + over * links;
     });
   });
 }
@@ -171,6 +192,7 @@ void ScalarSolver::apply(HierarchyField& x, bool homogeneous, const HierarchyFie
         for (int a = 0; a < DIM; ++a) k.beta[a] = beta_.at(g, i, a) + q;
         f == nullptr ? product_row<true>(k, from + q, n, to) : residual_row<true>(k, from + q, f + q, n, to);
       }
+      if (with_extra_) add_extra_row(extra_.at(g, i, 0) + q, from + q, n, f == nullptr ? 1 : -1, to);
       to += n;
     });
   });
@@ -224,7 +246,7 @@ double ScalarSolver::rounding(const Vector& x) const {
           links = 0;
           for (int a = 0; a < DIM; ++a) links += beta_.at(g, i, a)[o + q] + beta_.at(g, i, a)[o + q + layout.stride(a)];
         }
-        most = std::max(most, (sigma_ + over * links) * std::abs(*p));
+        most = std::max(most, (zeroth(g, i, o + q) + over * links) * std::abs(*p));
       }
     });
   }
@@ -377,7 +399,7 @@ void ScalarSolver::assemble() {
         global[a] = block.index.coord[a] * n + q[a];
       }
       // The direct solver's little something where the constant is free.
-      double diagonal = sigma_ * cell;
+      double diagonal = zeroth(g, i, mesh_.layout().offset(q)) * cell;
       for (int f = 0; f < FACES; ++f) {
         const int a = face_axis(f);
         IntVec beyond = global, face = q;

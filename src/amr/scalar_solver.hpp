@@ -1,5 +1,5 @@
 /// \file
-/// sigma x - div(beta grad x) = f for one unknown in cells, on all levels of the tree at once.
+/// (sigma + extra) x - div(beta grad x) = f for one unknown in cells, on all levels of the tree at once.
 #pragma once
 
 #include <array>
@@ -46,15 +46,20 @@ class ScalarSolver {
   HierarchyField& rhs() { return rhs_; }         ///< f in the leaves
   /// beta > 0 on the faces 0 to n of the leaves, component a along axis a. Where levels meet that of finer faces counts.
   HierarchyField& beta() { return beta_; }
+  /// >= 0 in the leaves: added to sigma cell by cell by prepare_with_extra.
+  HierarchyField& extra() { return extra_; }
 
   /// Before the first solution, and when sigma or beta have changed.
   void prepare(double sigma);                 ///< with beta()
+  void prepare_with_extra(double sigma);      ///< with beta() and extra()
   void prepare(double sigma, double beta);    ///< the same everywhere
   ScalarResult solve();
 
  private:
   using Vector = Gcr::Vector;
+  void prepare_beta(double sigma);
   void prepare_links(double sigma, const Links& links);
+  double zeroth(int g, int i, std::ptrdiff_t q) const { return with_extra_ ? sigma_ + extra_.at(g, i, 0)[q] : sigma_; }
   void weigh();
   void spread_beta();
   void fill(HierarchyField& f, bool homogeneous);
@@ -71,13 +76,14 @@ class ScalarSolver {
   ScalarOptions options_;
   const Mesh& mesh_;
   Hierarchy hierarchy_;
-  HierarchyField state_, rhs_, beta_;
+  HierarchyField state_, rhs_, beta_, extra_;
   Multigrid cycle_;
   Gcr gcr_;
   Pieces pieces_, volumes_;  // weighted for the Krylov method, and with volumes alone
   Array<int> kappa_{};
   double sigma_ = 0, factor_ = 1;
   bool floating_ = true;  // the constant is free
+  bool with_extra_ = false;
   std::unique_ptr<HypreSolver> hypre_;
 };
 

@@ -2,6 +2,7 @@
 /// Moving cell means between arrays of one or two levels. All boxes are given in cells of the destination.
 #pragma once
 
+#include <cmath>
 #include <cstddef>
 
 #include "amr/loops.hpp"
@@ -105,6 +106,85 @@ inline void prolong_box(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<con
     }
     *dst.at(fine) = child_value(src.at(coarse), src.stride, side);
   });
+}
+
+/// The smallest of all differences that are equal to x modulo `period`.
+inline double wrapped(double x, double period) { return x - period * std::nearbyint(x / period); }
+
+/// restrict_box and prolong_box for angles modulo `period`: 85 and 5 degrees are 10 degrees apart.
+inline void restrict_angles(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<const double> src, const IntVec& src_lo,
+                            const IntVec& size, double period) {
+  for_each_cell({}, size, [&](const IntVec& cell) {
+    IntVec to = dst_lo, from = src_lo;
+    for (int a = 0; a < DIM; ++a) {
+      to[a] += cell[a];
+      from[a] += 2 * cell[a];
+    }
+    const double* first = src.at(from);
+    double sum = 0;
+    for (int child = 1; child < CHILDREN; ++child) {
+      std::ptrdiff_t o = 0;
+      for (int a = 0; a < DIM; ++a) o += (child >> a & 1) * src.stride[a];
+      sum += wrapped(first[o] - *first, period);
+    }
+    *dst.at(to) = *first + sum / CHILDREN;
+  });
+}
+
+inline void prolong_angles(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<const double> src, const IntVec& size,
+                           double period) {
+  for_each_cell(dst_lo, size, [&](const IntVec& fine) {
+    IntVec coarse = fine;
+    for (int a = 0; a < DIM; ++a) coarse[a] = fine[a] >> 1;
+    const double* c = src.at(coarse);
+    double value = *c;
+    for (int a = 0; a < DIM; ++a) {
+      const double below = wrapped(*c - c[-src.stride[a]], period), above = wrapped(c[src.stride[a]] - *c, period);
+      const double least = std::abs(below) < std::abs(above) ? below : above;
+      if (below * above > 0) value += ((fine[a] & 1) != 0 ? 0.25 : -0.25) * least;
+    }
+    *dst.at(fine) = value;
+  });
+}
+
+/// The same for labels.
+inline void restrict_labels(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<const double> src, const IntVec& src_lo,
+                            const IntVec& size) {
+  for_each_cell({}, size, [&](const IntVec& cell) {
+    IntVec to = dst_lo, from = src_lo;
+    for (int a = 0; a < DIM; ++a) {
+      to[a] += cell[a];
+      from[a] += 2 * cell[a];
+    }
+    *dst.at(to) = *src.at(from);
+  });
+}
+
+inline void prolong_labels(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<const double> src, const IntVec& size) {
+  for_each_cell(dst_lo, size, [&](const IntVec& fine) {
+    IntVec coarse = fine;
+    for (int a = 0; a < DIM; ++a) coarse[a] = fine[a] >> 1;
+    *dst.at(fine) = *src.at(coarse);
+  });
+}
+
+/// As the row of a field in cells asks for.
+inline void restrict_cells(const FieldSpec& field, ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<const double> src,
+                           const IntVec& src_lo, const IntVec& size) {
+  switch (field.mixing) {
+    case Mixing::means: return restrict_box(dst, dst_lo, src, src_lo, size);
+    case Mixing::angles: return restrict_angles(dst, dst_lo, src, src_lo, size, field.period);
+    case Mixing::labels: return restrict_labels(dst, dst_lo, src, src_lo, size);
+  }
+}
+
+inline void prolong_cells(const FieldSpec& field, ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<const double> src,
+                          const IntVec& size) {
+  switch (field.mixing) {
+    case Mixing::means: return prolong_box(dst, dst_lo, src, size);
+    case Mixing::angles: return prolong_angles(dst, dst_lo, src, size, field.period);
+    case Mixing::labels: return prolong_labels(dst, dst_lo, src, size);
+  }
 }
 
 }  // namespace dendrift::amr

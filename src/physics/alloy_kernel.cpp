@@ -208,7 +208,11 @@ template <int N>
 // div F is expanded as Hessian of (a_s^2 p^2 / 2) : grad grad psi. With n = p/|p|, S = sum n_i^4, x_i = n_i^2 - S:
 //   div F = (a_s^2 - 16 eps a_s S) lap + 16 eps sum_ij n_i n_j [16 eps x_i x_j + s_i + s_j + 3 a_s delta_ij] M_ij,
 //   s_i = -a_s (2 x_i + S): products of n_i n_j only, no trigonometry.
-template <int N, bool Rotated>
+// Where grains meet, -(1+phi)/2 w with the disorder w becomes -w/[sqrt2 (1-phi)]. It grows without limit where phi nears
+// 1: see docs/equations.md for why a bound on it changes nothing but the way to the state of rest.
+enum class Axes : std::uint8_t { mesh, turned, mixed };
+
+template <int N, Axes KIND>
 void phase_rate(const AlloyBlock& blk, const AlloyParameters& par, Scratch<N>& s) {
   using S = Shape<N>;
   const double* psi = blk.psi;
@@ -221,14 +225,24 @@ void phase_rate(const AlloyBlock& blk, const AlloyParameters& par, Scratch<N>& s
   const double* t_ = s.t + S::ORIGIN;
   const double* u_ = s.u + S::ORIGIN;
   double* rate_ = s.rate + S::ORIGIN;
+  const Array<Array<const double*>> cell_axes = blk.axes;
+  const double* disorder = blk.disorder;
   const auto rate = [=](int at) __attribute__((always_inline)) {
     Derivatives d;
-    if constexpr (Rotated) {
+    if constexpr (KIND == Axes::mesh) {
+      derivatives<N>(psi + at, d);
+    } else if constexpr (KIND == Axes::turned) {
       Derivatives lab;
       derivatives<N>(psi + at, lab);
       rotate(lab, axes, d);
     } else {
-      derivatives<N>(psi + at, d);
+      Derivatives lab;
+      derivatives<N>(psi + at, lab);
+      double own[DIM][DIM];
+      EACH_AXIS(i)
+        EACH_AXIS(a) own[i][a] = cell_axes[i][a][at]; END_AXIS
+      END_AXIS
+      rotate(lab, own, d);
     }
     double q[DIM], p2 = tiny, p4 = 0;
     EACH_AXIS(i)
@@ -258,8 +272,9 @@ void phase_rate(const AlloyBlock& blk, const AlloyParameters& par, Scratch<N>& s
     const double div =
         h2 * ((1.0 / 6.0) * (a2 - e16 * as) * d.laplacian + (e16 * ip2) * (diagonal + 0.5 * beside));
     const double t = t_[at], phi = 1.0 - 2.0 * t;
-    const double r = ratio * ratio *
-                     (div + SQRT2 * phi * (1.0 - std::min(a2 * (to_p2 * p2), STEEPEST)) - drive * (t - t * t) * u_[at]);
+    double r = ratio * ratio *
+               (div + SQRT2 * phi * (1.0 - std::min(a2 * (to_p2 * p2), STEEPEST)) - drive * (t - t * t) * u_[at]);
+    if constexpr (KIND == Axes::mixed) r -= std::min(ratio * ratio * disorder[at] / (2.0 * SQRT2 * t), FASTEST_PULL);
     const bool held = (psi[at] >= PSI_MAX && r > 0) || (psi[at] <= -PSI_MAX && r < 0);
     rate_[at] = held ? 0.0 : r;
   };
@@ -427,10 +442,12 @@ void clear_fluxes(Scratch<N>& s) {
 template <int N>
 void rates(const AlloyBlock& blk, const AlloyParameters& par, Scratch<N>& s) {
   primitives<N>(blk.psi, blk.c, par.k, s);
-  if (par.rotated) {
-    phase_rate<N, true>(blk, par, s);
+  if (blk.disorder != nullptr) {
+    phase_rate<N, Axes::mixed>(blk, par, s);
+  } else if (par.rotated) {
+    phase_rate<N, Axes::turned>(blk, par, s);
   } else {
-    phase_rate<N, false>(blk, par, s);
+    phase_rate<N, Axes::mesh>(blk, par, s);
   }
   if (blk.noise > 0) add_noise<N>(blk, blk.psi, s);
 }

@@ -67,7 +67,7 @@ struct AlloyParameters {
   double lambda = 8.839;
   double diffusivity = 5.5394;  ///< D tau0 / W0^2
   double epsilon = 0.05;        ///< eps4
-  Array<RealVec> axes{};        ///< row i: crystal axis i in the frame of the mesh
+  Array<RealVec> axes{};        ///< row i: crystal axis i in the frame of the mesh; unless a block has its own for each cell
   bool rotated = false;         ///< axes differ from those of the mesh
   Antitrapping antitrapping = Antitrapping::material;
 };
@@ -87,6 +87,9 @@ struct AlloyBlock {
   std::array<const double*, DIM> velocity{};  ///< face velocities, or null: only the printed antitrapping reads them
   std::array<double*, FACES> face_flux{};     ///< where to leave the solute flux through a face, or null
   std::array<const double*, 2> ahead{};        ///< what the next call reads (psi and c), or null: fetched meanwhile
+  /// Component a of crystal axis i cell by cell, with one layer of ghosts; null: AlloyParameters::axes.
+  Array<Array<const double*>> axes{};
+  const double* disorder = nullptr;  ///< with axes: s |grad alpha| + e^2/2 |grad alpha|^2 of eq. (1), as they
   double dx = 1;
   double noise = 0;                ///< amplitude of the random rate of psi, 0: none
   std::uint64_t noise_key = 0;     ///< the same for all stages of a step
@@ -95,6 +98,10 @@ struct AlloyBlock {
 };
 
 enum class BlockKind : std::uint8_t { liquid, solid, interface };
+
+/// Largest rate at which disorder pulls psi down, W0/tau0. Where the pull of eq. (1) is stronger, 1 - phi is far below its
+/// value at rest.
+inline constexpr double FASTEST_PULL = 8.0;
 
 /// Whether psi lies at one bound everywhere in the block and its ghosts, so that the cheaper updates are exact.
 BlockKind classify(const double* psi, int n);

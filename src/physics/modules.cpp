@@ -1,6 +1,7 @@
 #include "physics/modules.hpp"
 
 #include "physics/flow.hpp"
+#include "physics/orientation.hpp"
 #include "physics/solidification.hpp"
 #include "physics/transport.hpp"
 #include "settings.hpp"
@@ -12,6 +13,8 @@ Modules make_modules(const Settings& s, std::vector<Seed>& seeds) {
   if (s.has_flow() && s.flow.prescribed()) m.push_back(std::make_unique<PrescribedFlow>(s.flow, s.scales, seeds));
   if (s.has_flow() && !s.flow.prescribed()) m.push_back(std::make_unique<Flow>(s.flow, s.scales, seeds));
   if (s.has_flow() && !s.phase_field.rigid) m.push_back(std::make_unique<Transport>(s.scales.k));
+  if (!seeds.empty() && (s.schema.has_table("orientation") || several_orientations(seeds, s.has_flow())))
+    m.push_back(std::make_unique<Orientation>(s.orientation, seeds));
   m.push_back(std::make_unique<Solidification>(s.phase_field, s.solute, s.scales, seeds));
   return m;
 }

@@ -102,9 +102,6 @@ void SeedOptions::declare(io::Schema& schema, std::vector<SeedOptions>& seeds) {
         checks.fail(name, "exactly one of radius_um and radius_W0", s.radius_um ? "both" : "neither");
       if (DIM == 2 && s.euler_deg != std::array<double, 3>{})
         checks.fail(name + ".euler_deg", "a scene in 3D (mesh.dim = 3); in 2D use angle_deg");
-      if (s.angle_deg != seeds[0].angle_deg || s.euler_deg != seeds[0].euler_deg)
-        checks.fail(name + (s.angle_deg != seeds[0].angle_deg ? ".angle_deg" : ".euler_deg"),
-                    "the orientation of the first seed: crystals of several orientations are not supported yet");
     }
   });
 }
@@ -130,6 +127,11 @@ std::vector<Seed> make_seeds(const std::vector<SeedOptions>& options, const Scal
     seeds.push_back(s);
   }
   return seeds;
+}
+
+bool several_orientations(const std::vector<Seed>& crystals, bool turning) {
+  if (crystals.size() > 1 && turning) return true;
+  return std::any_of(crystals.begin(), crystals.end(), [&](const Seed& s) { return s.axes != crystals.front().axes; });
 }
 
 std::array<double, 2> Seed::semi_axes() const {
@@ -210,7 +212,7 @@ std::vector<double> memory(const Seed& c) {
   m.insert(m.end(), c.velocity.begin(), c.velocity.end());
   m.insert(m.end(), c.spin.begin(), c.spin.end());
   for (const RealVec& axis : c.axes) m.insert(m.end(), axis.begin(), axis.end());
-  m.insert(m.end(), {c.rotated ? 1.0 : 0.0, c.angle, c.volume, c.nonrigidity});
+  m.insert(m.end(), {c.rotated ? 1.0 : 0.0, c.touching ? 1.0 : 0.0, c.angle, c.volume, c.nonrigidity});
   return m;
 }
 
@@ -225,6 +227,7 @@ void recall(Seed& c, std::span<const double> m) {
   take(c.spin);
   for (RealVec& axis : c.axes) take(axis);
   c.rotated = *next++ != 0;
+  c.touching = *next++ != 0;
   c.angle = *next++;
   c.volume = *next++;
   c.nonrigidity = *next++;

@@ -35,6 +35,7 @@ struct Seed {
   std::array<double, 3> spin{};  ///< rad/tau0; 2D: the last one
   double angle = 0;       ///< 2D: of axis 0, unwrapped, rad
   double volume = 0;      ///< 2D: area; measured with the motion
+  bool touching = false;  ///< another crystal touches it: its cells have angles of their own, eq. (4)
   double nonrigidity = 0; ///< rms deviation of the solid's velocity from rigid motion, over its rms velocity
 
   /// Moves and turns for a time dt.
@@ -44,6 +45,9 @@ struct Seed {
   /// Distance from the surface at the start, positive inside; r: place relative to the centre.
   double depth(const RealVec& r) const;
 };
+
+/// Whether crystals may have several orientations at some time: they start with several, or may turn.
+bool several_orientations(const std::vector<Seed>& crystals, bool turning);
 
 /// Unit quaternion (real part first, >= 0) that turns the axes of the mesh into those of the crystal.
 std::array<double, 4> quaternion(const Seed& crystal);

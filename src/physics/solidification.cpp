@@ -48,6 +48,7 @@ void Solidification::attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) {
   mesh_ = &mesh;
   ghosts_ = &ghosts;
   fluxes_ = std::make_unique<amr::FluxRegister>(mesh);
+  local_axes_.attach(mesh, ghosts);
   if (const auto v = mesh.fields().find("velocity_x")) velocity_.id = *v;
 }
 
@@ -73,7 +74,9 @@ double Solidification::explicit_limit(double dx) const {
   // The phase: (a_s + a_s'')/a_s along the interface times the isotropic Laplacian's 16/3; in 3D with a margin for
   // the anisotropic terms, which use plain differences.
   const double stiffness = (1 + 15 * phase_.anisotropy) / (1 - phase_.anisotropy);
-  const double phase = (DIM == 2 ? 16.0 / 3 : 8.0) * stiffness;
+  double phase = (DIM == 2 ? 16.0 / 3 : 8.0) * stiffness;
+  // Where grains meet: the derivative of the pull of disorder, w/[sqrt2 (1-phi)], by psi is -sqrt2 times the pull.
+  if (local_axes_.active()) phase += SQRT2 * FASTEST_PULL * dx * dx;
   constexpr double SAFETY = 0.9;
   return 2 * SAFETY * dx * dx / std::max(solute, phase);
 }
@@ -141,8 +144,11 @@ void Solidification::run_stage(const Stage& stage, double noise, std::uint64_t n
     if (b + 1 < mesh_->size()) k.ahead = {mesh_->cells(psi_, b + 1), mesh_->cells(c_, b + 1)};
     k.noise = noise;
     k.noise_key = noise_key + static_cast<std::uint64_t>(mesh_->block(b).index.level);
-    const BlockKind kind = classify(k.psi, layout.n);
-    advance_alloy(k, kind, parameters_, stage, layout.n);
+    AlloyParameters own = parameters_;
+    local_axes_.apply(b, k, own);
+    BlockKind kind = classify(k.psi, layout.n);
+    if (kind == BlockKind::solid && local_axes_.mixed(b)) kind = BlockKind::interface;  // a boundary of grains may form
+    advance_alloy(k, kind, own, stage, layout.n);
     if (measure) block_cost_[static_cast<std::size_t>(b)] = {omp_get_wtime() - begin, static_cast<double>(kind)};
   });
   // What the fine side of a face lets through is what the coarse side receives.
@@ -159,6 +165,7 @@ void Solidification::advance(double, double dt, std::int64_t step) {
   }
   if (phase_.frozen) return;
   turn_axes();
+  local_axes_.update(crystals_);
   const double dx = mesh_->shape().dx(mesh_->shape().max_level);
   const int s = stages(dt);
   const double w = 2.0 / (s * s + s) * dt;
@@ -208,12 +215,15 @@ double Solidification::front_speed() {
   const int n = mesh_->layout().n;
   const double band = phase_.band();
   std::vector<double> fastest(static_cast<std::size_t>(mesh_->size()), 0.0);
+  local_axes_.update(crystals_);
   amr::parallel_for(mesh_->size(), [&](int b) {
-    const AlloyBlock k = block_arrays(b);
+    AlloyBlock k = block_arrays(b);
+    AlloyParameters own = parameters_;
+    local_axes_.apply(b, k, own);
     if (classify(k.psi, n) != BlockKind::interface) return;
     thread_local std::vector<double> rate;
     rate.resize(static_cast<std::size_t>(volume(filled(n))));
-    psi_rate(k, parameters_, n, rate);
+    psi_rate(k, own, n, rate);
     const double* r = rate.data();
     double& v = fastest[static_cast<std::size_t>(b)];
     amr::for_each_cell({}, filled(n), [&](const IntVec& c) {

@@ -7,6 +7,7 @@
 #include <array>
 
 #include "amr/flux_register.hpp"
+#include "physics/local_axes.hpp"
 #include "physics/module.hpp"
 #include "physics/phase_field.hpp"
 #include "physics/solute.hpp"
@@ -54,6 +55,7 @@ class Solidification : public Module {
   Scales scales_;
   const std::vector<Seed>& crystals_;
   AlloyParameters parameters_;
+  LocalAxes local_axes_;
   amr::CellField psi_, c_, psi_other_, c_other_;
   amr::FaceField velocity_;  // id -1: no flow
   amr::Mesh* mesh_ = nullptr;
