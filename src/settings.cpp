@@ -6,6 +6,7 @@
 #include <algorithm>
 #include <array>
 #include <cmath>
+#include <filesystem>
 #include <optional>
 #include <stdexcept>
 #include <utility>
@@ -121,6 +122,7 @@ Settings::Settings() {
   mesh.declare(schema);
   alloy.declare(schema);
   physics::SeedOptions::declare(schema, seed);
+  seeding.declare(schema);
   phase_field.declare(schema);
   solute.declare(schema);
   orientation.declare(schema);
@@ -163,16 +165,32 @@ Settings::Settings() {
       }
     }
     if (!sized || !seeded) return;
-    const std::vector<physics::Seed> seeds = physics::make_seeds(seed, s);
+    std::vector<physics::SeedOptions> all = seed;
+    try {
+      all = all_seeds(choose_shape(size, mesh), s);
+    } catch (const physics::SeedingProblem& p) {
+      checks.fail(p.key, p.expected, p.found);
+    } catch (const std::invalid_argument&) {  // reported above
+    }
+    const std::vector<physics::Seed> seeds = physics::make_seeds(all, s);
     for (std::size_t i = 0; i < seeds.size(); ++i)
-      for (int a = 0; a < DIM; ++a)
-        if (seeds[i].position[a] < 0 || seeds[i].position[a] > size[a])
-          checks.fail("seed[" + std::to_string(i) + "]." + (seed[i].position_w0 ? "position_W0" : "position_um"),
-                      "a point inside the box");
+      for (int a = 0; a < DIM; ++a) {
+        if (seeds[i].position[a] >= 0 && seeds[i].position[a] <= size[a]) continue;
+        const bool listed = i < seed.size();
+        checks.fail(listed ? "seed[" + std::to_string(i) + "]." + (seed[i].position_w0 ? "position_W0" : "position_um") : "seeds.file",
+                    listed ? "a point inside the box" : fmt::format("points inside the box; seed {} of the file is not", i - seed.size() + 1));
+      }
   });
 }
 
+std::vector<physics::SeedOptions> Settings::all_seeds(const amr::MeshShape& box, const physics::Scales& s) const {
+  std::vector<physics::SeedOptions> all = seed;
+  for (const auto& more : {seeding.from_file(folder_), seeding.at_random(box, s)}) all.insert(all.end(), more.begin(), more.end());
+  return all;
+}
+
 void Settings::parse(const std::string& path, const std::vector<std::string>& overrides) {
+  folder_ = std::filesystem::path(path).parent_path().string();
   schema.parse(path, overrides);
   derive();
 }
@@ -187,6 +205,7 @@ void Settings::derive() {
   RealVec size{};
   for (int a = 0; a < DIM; ++a) size[a] = mesh.size_w0 ? (*mesh.size_w0)[a] : (*mesh.size_um)[a] / scales.w0_um;
   shape = choose_shape(size, mesh);
+  crystals = physics::make_seeds(all_seeds(shape, scales), scales);
   const auto in_tau0 = [&](const std::optional<double>& s, const std::optional<double>& tau0, double otherwise) {
     return tau0 ? *tau0 : s ? *s / scales.tau0_s : otherwise;
   };

@@ -13,6 +13,7 @@
 #include "physics/orientation.hpp"
 #include "physics/phase_field.hpp"
 #include "physics/scales.hpp"
+#include "physics/seeding.hpp"
 #include "physics/seeds.hpp"
 #include "physics/solute.hpp"
 
@@ -80,9 +81,11 @@ class Settings {
   physics::OrientationOptions orientation;
   physics::FlowOptions flow;
   std::vector<physics::SeedOptions> seed;
+  physics::SeedingOptions seeding;
   io::Schema schema;
 
   // Derived; valid after parse.
+  std::vector<physics::Seed> crystals;  ///< of [[seed]], then those of [seeds]: from the file, at random
   physics::Scales scales;
   amr::MeshShape shape;
   double end_time = 0;              ///< tau0
@@ -92,6 +95,8 @@ class Settings {
 
  private:
   void derive();
+  std::vector<physics::SeedOptions> all_seeds(const amr::MeshShape& shape, const physics::Scales& s) const;
+  std::string folder_;  // of the input file
 };
 
 /// Root blocks and levels whose finest cubic cells do not exceed dx: few root blocks under a deep tree, as long as the

@@ -62,7 +62,7 @@ class Compensated {
 void Simulation::request_stop() { stop_requested = 1; }
 
 Simulation::Simulation(Settings& settings, MPI_Comm comm, const std::optional<std::string>& checkpoint)
-    : settings_(settings), comm_(comm), crystals_(physics::make_seeds(settings.seed, settings.scales)) {
+    : settings_(settings), comm_(comm), crystals_(settings.crystals) {
   wall_start_ = MPI_Wtime();
   started_ = io::time_stamp();
   modules_ = physics::make_modules(settings, crystals_);
@@ -394,9 +394,9 @@ void Simulation::open_output() {
       const std::string tips = std::string("time_s,grain,arm,euler_deg,x_um,y_um,") + (DIM == 3 ? "z_um," : "") +
                                "speed_um_s,radius_um,off_axis_deg";
       const std::string grains =
-          DIM == 2 ? "time_s,grain,x_um,y_um,vx_um_s,vy_um_s,omega_rad_s,angle_rad,area_um2,nonrigidity"
+          DIM == 2 ? "time_s,grain,x_um,y_um,vx_um_s,vy_um_s,omega_rad_s,angle_rad,area_um2,nonrigidity,contacts"
                    : "time_s,grain,x_um,y_um,z_um,vx_um_s,vy_um_s,vz_um_s,omega_x_rad_s,omega_y_rad_s,omega_z_rad_s,"
-                     "q0,q1,q2,q3,volume_um3,nonrigidity";
+                     "q0,q1,q2,q3,volume_um3,nonrigidity,contacts";
       const double now = time_ * settings_.scales.tau0_s;
       if (resumed_) {
         grains_csv_ = std::make_unique<io::CsvFile>(path("grains.csv"), grains, "time_s", now);
@@ -468,7 +468,7 @@ void Simulation::write_grains(io::SharedFailure& failure) {
   // Without a flow the motion is known, but volumes are not.
   if (!settings_.has_flow() || settings_.flow.prescribed()) {
     std::vector<physics::Seed> measured = crystals_;
-    physics::measure_motion(*mesh_, psi_, {velocity.value_or(-1)}, measured);
+    physics::measure_motion(*mesh_, psi_, {mesh_->fields().find("grain").value_or(-1)}, {velocity.value_or(-1)}, measured);
     for (std::size_t g = 0; g < crystals_.size(); ++g) crystals_[g].volume = measured[g].volume;
   }
   if (mesh_->rank() != 0) return;
@@ -483,6 +483,7 @@ void Simulation::write_grains(io::SharedFailure& failure) {
       for (const double q : physics::quaternion(c)) line.push_back(q);
     line.push_back(c.volume * std::pow(s.w0_um, DIM));
     line.push_back(c.nonrigidity);
+    line.push_back(c.contacts);
     failure.attempt(path("grains.csv"), "write a line", [&] { grains_csv_->line(line); });
   }
 }

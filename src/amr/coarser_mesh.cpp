@@ -94,7 +94,7 @@ void CoarserMesh::restrict_child(int row, const Child& child, ArrayRef<double> t
   const IntVec half = filled(mesh_.layout().n / 2);
   const int normal = mesh_.fields().row(row).normal;
   if (normal < 0) {
-    restrict_box(to, lo, {from.p, from.stride}, {}, half);
+    restrict_cells(mesh_.fields().row(row), to, lo, {from.p, from.stride}, {}, half);
   } else {
     restrict_faces(to, lo, {from.p, from.stride}, half, normal);
   }

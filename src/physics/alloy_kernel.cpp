@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "amr/loops.hpp"
+#include "physics/counter_random.hpp"
 
 namespace dendrift::physics {
 
@@ -283,14 +284,6 @@ void phase_rate(const AlloyBlock& blk, const AlloyParameters& par, Scratch<N>& s
     const double* const later[] = {blk.psi_next, blk.c_next, blk.ahead[0], blk.ahead[1]};
     for (const double* array : later) fetch<N>(array, piece, pieces);
   });
-}
-
-// splitmix64: a counter in, 64 well-mixed bits out; the same on any number of ranks.
-inline std::uint64_t mix(std::uint64_t x) {
-  x += 0x9e3779b97f4a7c15U;
-  x = (x ^ (x >> 30)) * 0xbf58476d1ce4e5b9U;
-  x = (x ^ (x >> 27)) * 0x94d049bb133111ebU;
-  return x ^ (x >> 31);
 }
 
 template <int N>

@@ -256,7 +256,7 @@ void PrescribedFlow::report(Report& r) const {
 Flow::Flow(const FlowOptions& o, const Scales& s, std::vector<Seed>& crystals) : options_(o), scales_(s), crystals_(crystals) {
   const double time2 = s.tau0_s * s.tau0_s;
   solutal_ = o.solutal_buoyancy ? o.solutal_expansion_per_wt * s.c_l_wt : 0.0;
-  weight_ = o.solid_weight && o.motion == Motion::free ? o.solid_density_ratio - 1 : 0.0;
+  weight_ = o.solid_weight ? o.solid_density_ratio - 1 : 0.0;
   gravity_[DIM - 1] = -o.gravity_um_s2 * time2 / s.w0_um;
 }
 
@@ -290,6 +290,7 @@ void Flow::attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) {
   phase_ghosts_ = &ghosts;
   phase_.psi = {mesh.fields().find("psi").value()};
   phase_.c = {mesh.fields().find("c").value()};
+  phase_.grain = {mesh.fields().find("grain").value_or(-1)};
 }
 
 // A uniform velocity and v = curl of (U/k_y) sin(k_x x) sin(k_y y), as differences of what stands at edges: free of
@@ -339,7 +340,8 @@ void Flow::choose_mesh() {
   const amr::FieldTable& rows = phase_mesh_->fields();
   amr::FieldTable table;
   const auto cells = [&](amr::CellField f) { return table.add_cell(rows.row(f.id)); };
-  now_ = {cells(phase_.psi), cells(phase_.c), cells(phase_.pressure), cells(phase_.pressure_rate), {}, {}};
+  const auto if_any = [&](amr::CellField f) { return f.id < 0 ? f : cells(f); };
+  now_ = {cells(phase_.psi), cells(phase_.c), if_any(phase_.grain), cells(phase_.pressure), cells(phase_.pressure_rate), {}, {}};
   amr::FieldSpec faces;
   for (const auto& [name, field] : {std::pair{"velocity", &now_.v}, std::pair{"velocity_rate", &now_.v_rate}}) {
     faces.name = name;
@@ -456,25 +458,35 @@ void Flow::set_viscosity() {
   solver_->set_viscosity(phase, [&](double phi) { return nu * relative_viscosity(options_.viscosity, ratio, phi); });
   if (!penalised()) return;
   std::vector<RealVec> centres;
-  if (options_.motion == Motion::free)
-    for (const Seed& crystal : crystals_) centres.push_back(crystal.position);
-  solver_->set_drag(phase, [&](double phi) { return nu * relative_drag(phi); }, centres);
+  RigidBodies::Owners owners;
+  for (const Seed& crystal : crystals_) {
+    owners.body.push_back(held(crystal) ? RigidBodies::HELD : static_cast<int>(centres.size()));
+    if (!held(crystal)) centres.push_back(crystal.position);
+  }
+  if (now_.grain.id >= 0) owners.label = [this](int b) { return mesh_->cells(now_.grain, b); };
+  solver_->set_drag(phase, [&](double phi) { return nu * relative_drag(phi); }, centres, owners);
 }
 
 // Eqs. (5) and (6): what is known of the momentum at the end of the interval.
 void Flow::set_force(double sigma) {
   const amr::Layout& layout = mesh_->layout();
   const double c0 = 1 - (1 - scales_.k) * scales_.supersaturation;  // c0/c_l
+  std::vector<double> weights;  // of each crystal
+  for (const Seed& crystal : crystals_) weights.push_back(held(crystal) ? 0.0 : weight_);
+  if (weights.empty()) weights.push_back(0);
+  const bool alike = std::ranges::all_of(weights, [&](double w) { return w == weights[0]; });
   amr::parallel_for(mesh_->size(), [&](int b) {
     const auto [g, i] = solver_->hierarchy().place_of_block(b);
     thread_local std::vector<double> heavy_array;
     heavy_array.resize(static_cast<std::size_t>(layout.size()));
     double* heavy = heavy_array.data() + layout.interior();
     const double *psi = mesh_->cells(now_.psi, b), *c = mesh_->cells(now_.c, b);
+    const double* grain = alike || now_.grain.id < 0 ? nullptr : mesh_->cells(now_.grain, b);
     for (std::ptrdiff_t q = -layout.interior(); q < layout.size() - layout.interior(); ++q) {
       const double phi = phi_of_psi(psi[q]);
       const double liquid = options_.buoyancy == Buoyancy::mixture ? c[q] : 1 + (1 - scales_.k) * u_of_c(c[q], phi, scales_.k);
-      heavy[q] = 0.5 * (1 - phi) * solutal_ * (liquid - c0) + 0.5 * (1 + phi) * weight_;
+      const double weight = grain == nullptr ? weights[0] : weights[static_cast<std::size_t>(grain[q])];
+      heavy[q] = 0.5 * (1 - phi) * solutal_ * (liquid - c0) + 0.5 * (1 + phi) * weight;
     }
     for (int a = 0; a < DIM; ++a) {
       const std::ptrdiff_t s = layout.stride(a);
@@ -577,8 +589,8 @@ void Flow::shift(amr::HierarchyField& f, const RealVec& by, const Array<bool>& a
 // The true residual, in the one norm that tells how wrong a crystal's speed is: the drag that a disc (2D, without the
 // logarithm) or a sphere would have at the largest speed. Free crystals only.
 double Flow::unbalanced() const {
-  if (options_.motion == Motion::held || !(fastest_ > 0)) return 0;
-  const std::vector<RealVec> forces = net_forces(*mesh_, now_.psi, crystals_, [&](int b, int axis) {
+  if (!(fastest_ > 0)) return 0;
+  const std::vector<RealVec> forces = net_forces(*mesh_, now_.psi, now_.grain, crystals_, [&](int b, int axis) {
     const auto [g, i] = solver_->hierarchy().place_of_block(b);
     return solver_->residual().at(g, i, axis);
   });
@@ -587,14 +599,16 @@ double Flow::unbalanced() const {
     double square = 0;
     for (const double f : forces[g]) square += f * f;
     const double drag = DIM == 2 ? 4 * std::numbers::pi : 6 * std::numbers::pi * std::cbrt(0.75 / std::numbers::pi * crystals_[g].volume);
-    if (drag > 0) most = std::max(most, std::sqrt(square) / (drag * scales_.viscosity * fastest_));
+    if (drag > 0 && !held(crystals_[g])) most = std::max(most, std::sqrt(square) / (drag * scales_.viscosity * fastest_));
   }
   return most;
 }
 
 void Flow::solve(double elapsed) {
-  if (coarser_ != nullptr) coarser_->take({{now_.psi, now_.c}, {}});
-  ghosts_->fill({now_.psi, now_.c});
+  std::vector<amr::CellField> seen{now_.psi, now_.c};
+  if (now_.grain.id >= 0) seen.push_back(now_.grain);
+  if (coarser_ != nullptr) coarser_->take({seen, {}});
+  ghosts_->fill(seen);
   load();
   set_viscosity();
   const double sigma = 1 / elapsed;
@@ -660,7 +674,13 @@ void Flow::advance(double t, double dt, std::int64_t) {
   if (cells > MOST_CELLS * std::max(1.0, options_.courant))
     throw NumericalError(fmt::format("the flow has become too fast for the step: {:.3g} cells in {:.3g} tau0; a smaller "
                                      "phase_field.max_dt_tau0 may help", cells, dt));
-  measure_motion(*phase_mesh_, phase_.psi, options_.motion == Motion::held ? amr::FaceField{} : phase_.v, crystals_);
+  measure_motion(*phase_mesh_, phase_.psi, phase_.grain, phase_.v, crystals_);
+  for (Seed& crystal : crystals_)
+    if (held(crystal)) {
+      crystal.velocity = {};
+      crystal.spin = {};
+      crystal.nonrigidity = 0;
+    }
   last_ = t;
   next_ = t + interval_;
   due_ = false;

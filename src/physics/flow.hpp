@@ -2,6 +2,7 @@
 /// The velocity of the melt and of the crystals in it: table [flow]; eqs. (5) and (6).
 #pragma once
 
+#include <algorithm>
 #include <memory>
 #include <optional>
 
@@ -128,7 +129,10 @@ class Flow : public Module {
   void complete();
   void extrapolate(double elapsed);
   void set_viscosity();
-  bool penalised() const { return options_.solid == SolidModel::penalised || options_.motion == Motion::held; }
+  bool held(const Seed& crystal) const { return options_.motion == Motion::held || crystal.held; }
+  bool penalised() const {
+    return options_.solid == SolidModel::penalised || std::ranges::any_of(crystals_, [this](const Seed& s) { return held(s); });
+  }
   void set_force(double sigma);
   void add_inertia(int b);
   double unbalanced() const;
@@ -142,7 +146,7 @@ class Flow : public Module {
   double solutal_, weight_;  // alpha_c c_l and rho_s/rho_l - 1, times the switches
   RealVec gravity_{};  // W0/tau0^2
   struct Fields {
-    amr::CellField psi, c, pressure, pressure_rate;
+    amr::CellField psi, c, grain, pressure, pressure_rate;  // grain: id -1 where there is one crystal
     amr::FaceField v, v_rate;
   };
   Fields phase_, now_;  // on the mesh of the phase, and on that of the solver

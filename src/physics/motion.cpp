@@ -37,8 +37,8 @@ struct Sample {
 
 class Solid {
  public:
-  Solid(const amr::Mesh& mesh, amr::CellField psi, amr::FaceField velocity, const std::vector<Seed>& crystals)
-      : mesh_(mesh), psi_(psi), velocity_(velocity), crystals_(crystals) {}
+  Solid(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain, amr::FaceField velocity, const std::vector<Seed>& crystals)
+      : mesh_(mesh), psi_(psi), grain_(grain), velocity_(velocity), crystals_(crystals) {}
 
   /// Sums over all solid of what add(sums of the crystal, sample) adds; `width` sums a crystal.
   template <class Add>
@@ -67,7 +67,7 @@ class Solid {
         // only where there is no core at all.
         constexpr double CORE = 0.95, FAINT = 1e-9;
         Sample s{0, f * cell, f > CORE ? cell : FAINT * f * cell, {}, widened(v)};
-        find_crystal(x, s);
+        find_crystal(x, b, o, s);
         add(part.data() + s.crystal * width, s);
       });
     });
@@ -77,29 +77,39 @@ class Solid {
     return amr::exact_sums(total, mesh_.comm());
   }
 
-  /// Sets the crystal whose centre is nearest to x, and the way from there.
-  void find_crystal(const RealVec& x, Sample& s) const {
-    const RealVec lo = mesh_.shape().lo, hi = mesh_.shape().hi();
-    const Array<bool> periodic = mesh_.shape().periodic();
+  /// Sets the crystal that the cell at x belongs to, and the way from its centre.
+  void find_crystal(const RealVec& x, int b, std::ptrdiff_t cell, Sample& s) const {
+    if (grain_.id >= 0) {
+      s.crystal = static_cast<std::size_t>(mesh_.cells(grain_, b)[cell]);
+      s.r = widened(way(crystals_[s.crystal], x));
+      return;
+    }
     double least = 1e300;
     for (std::size_t g = 0; g < crystals_.size(); ++g) {
-      RealVec r{};
-      double square = 0;
-      for (int a = 0; a < DIM; ++a) {
-        r[a] = x[a] - crystals_[g].position[a];
-        if (periodic[a]) r[a] -= (hi[a] - lo[a]) * std::round(r[a] / (hi[a] - lo[a]));
-        square += r[a] * r[a];
-      }
+      const Vector3 r = widened(way(crystals_[g], x));
+      const double square = dot(r, r);
       if (square >= least) continue;
       least = square;
       s.crystal = g;
-      s.r = widened(r);
+      s.r = r;
     }
   }
 
  private:
+  // From the crystal's centre, or from its nearest image.
+  RealVec way(const Seed& crystal, const RealVec& x) const {
+    const RealVec lo = mesh_.shape().lo, hi = mesh_.shape().hi();
+    const Array<bool> periodic = mesh_.shape().periodic();
+    RealVec r{};
+    for (int a = 0; a < DIM; ++a) {
+      r[a] = x[a] - crystal.position[a];
+      if (periodic[a]) r[a] -= (hi[a] - lo[a]) * std::round(r[a] / (hi[a] - lo[a]));
+    }
+    return r;
+  }
+
   const amr::Mesh& mesh_;
-  amr::CellField psi_;
+  amr::CellField psi_, grain_;
   amr::FaceField velocity_;
   const std::vector<Seed>& crystals_;
 };
@@ -115,10 +125,10 @@ Vector3 spin_of(const Vector3& l, const double* inertia) {
 
 }  // namespace
 
-std::vector<RealVec> net_forces(const amr::Mesh& mesh, amr::CellField psi, const std::vector<Seed>& crystals,
+std::vector<RealVec> net_forces(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain, const std::vector<Seed>& crystals,
                                 const std::function<const double*(int b, int axis)>& force) {
   const amr::Layout& layout = mesh.layout();
-  const Solid solid(mesh, psi, {}, crystals);
+  const Solid solid(mesh, psi, grain, {}, crystals);
   std::vector<std::vector<double>> parts(at(mesh.size()));
   amr::parallel_for(mesh.size(), [&](int b) {
     const amr::Block& block = mesh.block(b);
@@ -131,7 +141,7 @@ std::vector<RealVec> net_forces(const amr::Mesh& mesh, amr::CellField psi, const
       RealVec x{};
       for (int a = 0; a < DIM; ++a) x[a] = block.lo[a] + (q[a] + 0.5) * block.dx;
       Sample s{};
-      solid.find_crystal(x, s);
+      solid.find_crystal(x, b, o, s);
       parts[at(b)].resize(DIM * crystals.size());
       for (int a = 0; a < DIM; ++a) {
         const double* f = force(b, a) + o;
@@ -148,9 +158,10 @@ std::vector<RealVec> net_forces(const amr::Mesh& mesh, amr::CellField psi, const
   return net;
 }
 
-void measure_motion(const amr::Mesh& mesh, amr::CellField psi, amr::FaceField velocity, std::vector<Seed>& crystals) {
+void measure_motion(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain, amr::FaceField velocity,
+                    std::vector<Seed>& crystals) {
   if (crystals.empty()) return;
-  const Solid solid(mesh, psi, velocity, crystals);
+  const Solid solid(mesh, psi, grain, velocity, crystals);
   constexpr std::size_t FIRST = 8, SECOND = 9, THIRD = 2;
   const std::vector<double> first = solid.sums(FIRST, [](double* sum, const Sample& s) {
     sum[0] += s.weight;

@@ -11,13 +11,14 @@
 namespace dendrift::physics {
 
 /// Sets velocity, spin, volume and nonrigidity of each crystal: the rigid motion that fits the velocity of its core
-/// (phi > .9) best, by least squares. Without a velocity (id -1) nothing moves. The solid nearest to a crystal's centre counts as its own. Collective; the same on all
-/// ranks and whatever their number.
-void measure_motion(const amr::Mesh& mesh, amr::CellField psi, amr::FaceField velocity, std::vector<Seed>& crystals);
+/// (phi > .9) best, by least squares. Without a velocity (id -1) nothing moves. `grain`: whose a cell is; without it (id -1) that
+/// of the nearest centre. Collective; the same on all ranks and whatever their number.
+void measure_motion(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain, amr::FaceField velocity,
+                    std::vector<Seed>& crystals);
 
 /// Net force on each crystal and the interface round it (phi > -.99), of a force per mass on faces: force(b, axis) points
 /// at cell (0,0[,0]) of local block b. Collective, the same on any ranks.
-std::vector<RealVec> net_forces(const amr::Mesh& mesh, amr::CellField psi, const std::vector<Seed>& crystals,
+std::vector<RealVec> net_forces(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain, const std::vector<Seed>& crystals,
                                 const std::function<const double*(int b, int axis)>& force);
 
 }  // namespace dendrift::physics

@@ -58,13 +58,6 @@ double inverse_mobility(Mobility law, double w) {
 Orientation::Orientation(const OrientationOptions& options, std::vector<Seed>& crystals) : options_(options), crystals_(crystals) {}
 
 void Orientation::declare(amr::FieldTable& fields) {
-  amr::FieldSpec grain;
-  grain.name = "grain";
-  grain.doc = "number of the crystal that a cell belongs to, or is nearest to";
-  grain.transfer = amr::Transfer::conservative;
-  grain.mixing = amr::Mixing::labels;
-  grain.checkpoint = true;
-  grain_ = fields.add_cell(grain);
   if constexpr (DIM == 3) return;
   amr::FieldSpec alpha;
   alpha.name = "alpha";
@@ -94,58 +87,12 @@ void Orientation::attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) {
   mesh_ = &mesh;
   ghosts_ = &ghosts;
   psi_.id = mesh.fields().find("psi").value();
+  grain_.id = mesh.fields().find("grain").value();
   v_.id = mesh.fields().find("velocity_x").value_or(-1);
 }
 
 void Orientation::initialize() {
-  label_nearest_seed();
   if constexpr (DIM == 2) impose(crystals_);
-}
-
-// Stands in for a module that labels grains as they move and grow.
-void Orientation::label_nearest_seed() {
-  const amr::Layout& layout = mesh_->layout();
-  const Array<bool> periodic = mesh_->shape().periodic();
-  const RealVec lo = mesh_->shape().lo, hi = mesh_->shape().hi();
-  amr::parallel_for(mesh_->size(), [&](int b) {
-    const amr::Block& block = mesh_->block(b);
-    double* grain = mesh_->cells(grain_, b);
-    amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
-      double most = -1e300;
-      for (std::size_t g = 0; g < crystals_.size(); ++g) {
-        RealVec r{};
-        for (int a = 0; a < DIM; ++a) {
-          r[a] = block.lo[a] + (cell[a] + 0.5) * block.dx - crystals_[g].position[a];
-          if (periodic[a]) r[a] -= std::round(r[a] / (hi[a] - lo[a])) * (hi[a] - lo[a]);
-        }
-        if (const double depth = crystals_[g].depth(r); depth > most) {
-          most = depth;
-          grain[layout.offset(cell)] = static_cast<double>(g);
-        }
-      }
-    });
-  });
-}
-
-// Stands in for the same module: crystals touch once solid of both lies on either side of a face. They stay in touch.
-void Orientation::find_contacts() {
-  constexpr double SOLID = -2.0821;  // psi of phi = -.9
-  const amr::Layout& layout = mesh_->layout();
-  ghosts_->fill({psi_, grain_});
-  std::vector<double> touching(crystals_.size(), 0.0);
-  for (int b = 0; b < mesh_->size(); ++b) {
-    const double *psi = mesh_->cells(psi_, b), *grain = mesh_->cells(grain_, b);
-    for (int a = 0; a < DIM; ++a) {
-      const std::ptrdiff_t s = layout.stride(a);
-      amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
-        const std::ptrdiff_t q = layout.offset(cell);
-        if (grain[q] == grain[q + s] || psi[q] < SOLID || psi[q + s] < SOLID) return;
-        touching[static_cast<std::size_t>(grain[q])] = touching[static_cast<std::size_t>(grain[q + s])] = 1;
-      });
-    }
-  }
-  MPI_Allreduce(MPI_IN_PLACE, touching.data(), static_cast<int>(touching.size()), MPI_DOUBLE, MPI_MAX, mesh_->comm());
-  for (std::size_t g = 0; g < crystals_.size(); ++g) crystals_[g].touching = crystals_[g].touching || touching[g] > 0;
 }
 
 // The angle of its grain wherever eq. (4) has nothing to say.
@@ -163,7 +110,6 @@ void Orientation::impose(const std::vector<Seed>& crystals) {
 }
 
 void Orientation::advance(double, double dt, std::int64_t) {
-  find_contacts();
   if constexpr (DIM == 3) return;
   std::vector<Seed> moved = crystals_;  // where they are at the end of the step
   for (Seed& s : moved) s.advance(dt);

@@ -49,8 +49,6 @@ class Orientation : public Module {
   int solver_iterations() const { return iterations_; }  ///< of the last solution
 
  private:
-  void label_nearest_seed();
-  void find_contacts();
   void impose(const std::vector<Seed>& crystals);
   void carry(double dt);
   void carry_stage(amr::CellField from, amr::CellField to, double old_share, double dt);

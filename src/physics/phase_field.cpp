@@ -53,6 +53,7 @@ void set_seeds(amr::Mesh& mesh, amr::CellField psi, const std::vector<Seed>& see
   amr::for_each_cell({}, filled(layout.n), [&](const IntVec& c) {
     double value = -PSI_MAX;
     for (const Seed& s : seeds) {
+      if (!s.present) continue;
       RealVec r{};
       for (int a = 0; a < DIM; ++a) {
         r[a] = block.lo[a] + (c[a] + 0.5) * block.dx - s.position[a];

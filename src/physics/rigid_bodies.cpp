@@ -26,7 +26,8 @@ RigidMotion RigidBodies::mode(const Face& f) {
   return m;
 }
 
-void RigidBodies::build(const amr::Hierarchy& hierarchy, const amr::HierarchyField& drag, const std::vector<RealVec>& centres) {
+void RigidBodies::build(const amr::Hierarchy& hierarchy, const amr::HierarchyField& drag, const std::vector<RealVec>& centres,
+                        const Owners& owners) {
   hierarchy_ = &hierarchy;
   const amr::Mesh& mesh = hierarchy.mesh();
   const amr::Layout& layout = mesh.layout();
@@ -40,6 +41,7 @@ void RigidBodies::build(const amr::Hierarchy& hierarchy, const amr::HierarchyFie
   amr::parallel_for(mesh.size(), [&](int b) {
     const auto [g, i] = hierarchy.place_of_block(b);
     const amr::Block& block = mesh.block(b);
+    const double* labels = owners.label ? owners.label(b) : nullptr;
     for (int axis = 0; axis < DIM; ++axis) {
       const double* k = drag.at(g, i, axis);
       amr::Component component = drag.component(axis);
@@ -48,19 +50,29 @@ void RigidBodies::build(const amr::Hierarchy& hierarchy, const amr::HierarchyFie
         const std::ptrdiff_t place = layout.offset(q);
         if (k[place] <= 0) return;
         Face f{place, axis, 0, k[place], std::pow(block.dx, DIM), {}};
-        double least = 1e300;
-        for (std::size_t n = 0; n < centres.size(); ++n) {
+        const auto arm_from = [&](std::size_t n) {
           RealVec arm{};
-          double square = 0;
           for (int a = 0; a < DIM; ++a) {
             arm[a] = block.lo[a] + (q[a] + (a == axis ? 0.0 : 0.5)) * block.dx - centres[n][a];
             if (periodic[a]) arm[a] -= (hi[a] - lo[a]) * std::round(arm[a] / (hi[a] - lo[a]));
-            square += arm[a] * arm[a];
           }
-          if (square >= least) continue;
-          least = square;
-          f.arm = arm;
-          f.body = static_cast<int>(n);
+          return arm;
+        };
+        if (labels != nullptr) {
+          f.body = owners.body[static_cast<std::size_t>(labels[place])];
+          if (f.body == HELD) return;
+          f.arm = arm_from(at(f.body));
+        } else {
+          double least = 1e300;
+          for (std::size_t n = 0; n < centres.size(); ++n) {
+            const RealVec arm = arm_from(n);
+            double square = 0;
+            for (const double x : arm) square += x * x;
+            if (square >= least) continue;
+            least = square;
+            f.arm = arm;
+            f.body = static_cast<int>(n);
+          }
         }
         faces_[at(b)].push_back(f);
         std::vector<double>& part = parts[at(b)];

@@ -4,6 +4,7 @@
 #pragma once
 
 #include <array>
+#include <functional>
 #include <vector>
 
 #include "amr/hierarchy.hpp"
@@ -18,8 +19,16 @@ using RigidMotion = std::array<double, RIGID>;
 /// drag: what is left exerts no force and no torque.
 class RigidBodies {
  public:
-  /// `drag`: on the faces of all leaves. A face belongs to the nearest centre. Collective.
-  void build(const amr::Hierarchy& hierarchy, const amr::HierarchyField& drag, const std::vector<RealVec>& centres);
+  /// Whose the cells are: label(b) points at cell (0,0[,0]) of an array of labels, body[label] is the body or HELD. Without
+  /// labels a face belongs to the nearest centre.
+  struct Owners {
+    std::function<const double*(int b)> label;
+    std::vector<int> body;
+  };
+  static constexpr int HELD = -1;  ///< no motion of its own: 0
+  /// `drag`: on the faces of all leaves. Collective.
+  void build(const amr::Hierarchy& hierarchy, const amr::HierarchyField& drag, const std::vector<RealVec>& centres,
+             const Owners& owners);
   bool empty() const { return motions_.empty(); }
 
   /// The motions that fit v best; kept until the next fit. Collective, the same on any ranks.

@@ -88,9 +88,13 @@ void SeedOptions::declare(io::Schema& schema, std::vector<SeedOptions>& seeds) {
             .unit("degree")
             .range(-360, 360)
             .doc("3D only: turns about z, then x, then z (Bunge), after angle_deg");
+        t.real("nucleation_time_s", s.nucleation_time_s).unit("s").at_least(0).doc("when it appears, if the melt there is undercooled; default: at the start");
+        t.real("nucleation_time_tau0", s.nucleation_time_tau0).unit("tau0").at_least(0).doc("the same in units of tau0");
+        t.boolean("held", s.held).doc("kept in its place by a resistance; beside free crystals needs flow.solid = \"penalised\"");
       });
   schema.check({"seed"}, [&seeds](io::Checks& checks) {
-    if (seeds.empty() && !checks.has_table("flow")) checks.fail("seed", "at least one [[seed]], unless there is a table [flow]");
+    if (seeds.empty() && !checks.has_table("flow") && !checks.has_table("seeds"))
+      checks.fail("seed", "at least one [[seed]], unless there is a table [seeds] or [flow]");
   });
   schema.check([&seeds](io::Checks& checks) {
     for (std::size_t i = 0; i < seeds.size(); ++i) {
@@ -100,6 +104,8 @@ void SeedOptions::declare(io::Schema& schema, std::vector<SeedOptions>& seeds) {
         checks.fail(name, "exactly one of position_um and position_W0", s.position_um ? "both" : "neither");
       if (s.radius_um.has_value() == s.radius_w0.has_value())
         checks.fail(name, "exactly one of radius_um and radius_W0", s.radius_um ? "both" : "neither");
+      if (s.nucleation_time_s && s.nucleation_time_tau0)
+        checks.fail(name, "at most one of nucleation_time_s and nucleation_time_tau0", "both");
       if (DIM == 2 && s.euler_deg != std::array<double, 3>{})
         checks.fail(name + ".euler_deg", "a scene in 3D (mesh.dim = 3); in 2D use angle_deg");
     }
@@ -124,6 +130,9 @@ std::vector<Seed> make_seeds(const std::vector<SeedOptions>& options, const Scal
       }
     }
     s.angle = std::atan2(s.axes[0][1], s.axes[0][0]);
+    s.nucleation_time = o.nucleation_time_tau0 ? *o.nucleation_time_tau0 : o.nucleation_time_s.value_or(0) / scales.tau0_s;
+    s.present = s.nucleation_time <= 0;
+    s.held = o.held;
     seeds.push_back(s);
   }
   return seeds;
@@ -212,7 +221,8 @@ std::vector<double> memory(const Seed& c) {
   m.insert(m.end(), c.velocity.begin(), c.velocity.end());
   m.insert(m.end(), c.spin.begin(), c.spin.end());
   for (const RealVec& axis : c.axes) m.insert(m.end(), axis.begin(), axis.end());
-  m.insert(m.end(), {c.rotated ? 1.0 : 0.0, c.touching ? 1.0 : 0.0, c.angle, c.volume, c.nonrigidity});
+  for (const bool b : {c.rotated, c.touching, c.present, c.refused}) m.push_back(b ? 1.0 : 0.0);
+  m.insert(m.end(), {static_cast<double>(c.contacts), c.angle, c.volume, c.nonrigidity});
   return m;
 }
 
@@ -226,8 +236,8 @@ void recall(Seed& c, std::span<const double> m) {
   take(c.velocity);
   take(c.spin);
   for (RealVec& axis : c.axes) take(axis);
-  c.rotated = *next++ != 0;
-  c.touching = *next++ != 0;
+  for (bool* b : {&c.rotated, &c.touching, &c.present, &c.refused}) *b = *next++ != 0;
+  c.contacts = static_cast<int>(*next++);
   c.angle = *next++;
   c.volume = *next++;
   c.nonrigidity = *next++;

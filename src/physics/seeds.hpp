@@ -20,6 +20,8 @@ struct SeedOptions {
   double aspect_ratio = 1;
   double angle_deg = 0;
   std::array<double, 3> euler_deg{};
+  std::optional<double> nucleation_time_s, nucleation_time_tau0;
+  bool held = false;
 
   static void declare(io::Schema& schema, std::vector<SeedOptions>& seeds);
 };
@@ -35,6 +37,11 @@ struct Seed {
   std::array<double, 3> spin{};  ///< rad/tau0; 2D: the last one
   double angle = 0;       ///< 2D: of axis 0, unwrapped, rad
   double volume = 0;      ///< 2D: area; measured with the motion
+  double nucleation_time = 0;  ///< tau0
+  bool held = false;      ///< by a resistance, in its place
+  bool present = true;    ///< has nucleated
+  bool refused = false;   ///< and never will: there was no undercooled melt
+  int contacts = 0;       ///< crystals that it touches
   bool touching = false;  ///< another crystal touches it: its cells have angles of their own, eq. (4)
   double nonrigidity = 0; ///< rms deviation of the solid's velocity from rigid motion, over its rms velocity
 

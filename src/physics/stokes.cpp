@@ -178,7 +178,7 @@ void StokesSolver::set_viscosity(const std::function<void(int, double*)>& phase,
 }
 
 void StokesSolver::set_drag(const std::function<void(int, double*)>& phase, const std::function<double(double)>& law,
-                            const std::vector<RealVec>& centres) {
+                            const std::vector<RealVec>& centres, const RigidBodies::Owners& owners) {
   std::vector<Component> faces(DIM);
   for (int a = 0; a < DIM; ++a) faces[at(a)].normal = a;
   if (drag_ == nullptr) {
@@ -211,7 +211,7 @@ void StokesSolver::set_drag(const std::function<void(int, double*)>& phase, cons
   largest_drag_ = std::max(amr::global_max(largest, mesh_.comm()), 1e-300);
   for (int g = 0; g + 1 < hierarchy_.grids(); ++g) hierarchy_.restrict_means(*drag_, *drag_, g);
   for (int g = 0; g < hierarchy_.grids(); ++g) hierarchy_.exchange(*drag_, g, 1);
-  bodies_.build(hierarchy_, *drag_, centres);
+  bodies_.build(hierarchy_, *drag_, centres, owners);
 }
 
 // -div[1/(sigma + kappa) grad], which the solid's drag stops.

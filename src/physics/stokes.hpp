@@ -58,10 +58,10 @@ class StokesSolver {
   /// `phase(b, cell array)`: writes phi of local block b, two layers of ghosts included; `law(phi)`: the viscosity.
   void set_viscosity(const std::function<void(int b, double* phi)>& phase, const std::function<double(double)>& law);
 
-  /// Adds kappa (v - v_rigid) to the left side, kappa = law(phi on the face). v_rigid: for the faces nearest to each centre
-  /// the rigid motion that leaves no net force and torque; without centres 0, which holds the solid in its place.
+  /// Adds kappa (v - v_rigid) to the left side, kappa = law(phi on the face). v_rigid: for the faces of each body the rigid
+  /// motion about its centre that leaves no net force and torque; 0 for those that are held, and without centres.
   void set_drag(const std::function<void(int b, double* phi)>& phase, const std::function<double(double)>& law,
-                const std::vector<RealVec>& centres);
+                const std::vector<RealVec>& centres, const RigidBodies::Owners& owners = {});
 
   StokesResult solve(double sigma);
   /// What the last solution leaves of the momentum equation, on the unknown faces of the leaves. Faces that finer leaves
