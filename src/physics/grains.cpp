@@ -212,7 +212,7 @@ void Grains::find_contacts() {
         const std::ptrdiff_t q = layout.offset(cell);
         const double thinnest = std::min(psi[q], psi[q + s]);
         if (grain[q] == grain[q + s] || thinnest < MARKED) return;
-        const auto [low, high] = std::minmax(static_cast<int>(grain[q]), static_cast<int>(grain[q + s]));
+        const auto [low, high] = std::minmax({static_cast<int>(grain[q]), static_cast<int>(grain[q + s])});
         parts[at(b)].insert({low, high, thinnest > 0 ? 1 : 0});
       });
     }
