@@ -9,13 +9,13 @@
 #include "amr/comm.hpp"
 #include "amr/loops.hpp"
 #include "physics/alloy_kernel.hpp"
-#include "physics/phase_field.hpp"
 
 namespace dendrift::physics {
 
 namespace {
 
-constexpr double MARKED = -2.0821;  // psi of phi = -.9: solid enough to have a marker
+constexpr double MARKED = 1;       // psi of phi = .61: solid enough to have a marker; softer, it is sheared by the melt
+constexpr double TOUCHED = -2.0821;  // psi of phi = -.9, on both sides of a contact
 
 std::size_t at(int i) { return static_cast<std::size_t>(i); }
 
@@ -27,7 +27,8 @@ bool uniform(const double* values, const amr::Layout& layout) {
 
 }  // namespace
 
-Grains::Grains(const Scales& scales, double band, std::vector<Seed>& crystals) : scales_(scales), band_(band), crystals_(crystals) {}
+Grains::Grains(const Scales& scales, const PhaseFieldOptions& phase, std::vector<Seed>& crystals)
+    : scales_(scales), phase_(phase), crystals_(crystals) {}
 
 void Grains::declare(amr::FieldTable& fields) {
   amr::FieldSpec f;
@@ -101,7 +102,12 @@ void Grains::advance(double t, double dt, std::int64_t) {
   const double moved = v_.id >= 0 ? move_markers(dt) : 0.0;
   if (moved < FAR && waited_ < MOST_STEPS) return;
   waited_ = 0;
-  assign();
+  if (phase_.rigid) {  // crystals keep the shapes of their seeds
+    initialize();
+    ghosts_->fill({psi_});
+  } else {
+    assign();
+  }
   find_contacts();
 }
 
@@ -211,7 +217,7 @@ void Grains::find_contacts() {
       amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
         const std::ptrdiff_t q = layout.offset(cell);
         const double thinnest = std::min(psi[q], psi[q + s]);
-        if (grain[q] == grain[q + s] || thinnest < MARKED) return;
+        if (grain[q] == grain[q + s] || thinnest < TOUCHED) return;
         const auto [low, high] = std::minmax({static_cast<int>(grain[q]), static_cast<int>(grain[q + s])});
         parts[at(b)].insert({low, high, thinnest > 0 ? 1 : 0});
       });
@@ -261,7 +267,7 @@ bool Grains::undercooled(const Seed& seed) const {
   std::vector<char> bad(at(mesh_->size()), 0);
   near_seed(seed, AROUND, [&](int b, std::ptrdiff_t q, double) {
     const double psi = mesh_->cells(psi_, b)[q];
-    if (psi > MARKED || u_of_c(mesh_->cells(c_, b)[q], phi_of_psi(psi), scales_.k) >= 0) bad[at(b)] = 1;
+    if (psi > TOUCHED || u_of_c(mesh_->cells(c_, b)[q], phi_of_psi(psi), scales_.k) >= 0) bad[at(b)] = 1;
   });
   return !amr::global_any(std::ranges::find(bad, 1) != bad.end(), mesh_->comm());
 }
@@ -318,12 +324,12 @@ void Grains::tag(int b, amr::Tag& tag) const {
       const std::ptrdiff_t s = layout.stride(a);
       amr::for_each_cell(filled(-1), filled(layout.n + 1), [&](const IntVec& cell) {
         const std::ptrdiff_t q = layout.offset(cell);
-        if (grain[q] != grain[q + s] && psi[q] > MARKED && psi[q + s] > MARKED) tag.level = tag.keep = finest;
+        if (grain[q] != grain[q + s] && psi[q] > TOUCHED && psi[q + s] > TOUCHED) tag.level = tag.keep = finest;
       });
     }
   for (const Seed& s : crystals_) {
     if (s.present || s.refused) continue;
-    tag_seeds(*mesh_, {s}, band_, b, tag);
+    tag_seeds(*mesh_, {s}, phase_.band(), b, tag);
   }
 }
 

@@ -6,6 +6,7 @@
 #include <vector>
 
 #include "physics/module.hpp"
+#include "physics/phase_field.hpp"
 #include "physics/scales.hpp"
 #include "physics/seeds.hpp"
 
@@ -20,7 +21,7 @@ namespace dendrift::physics {
 /// neighbour which has the largest psi, so that labels are there before the front is.
 class Grains : public Module {
  public:
-  Grains(const Scales& scales, double band, std::vector<Seed>& crystals);
+  Grains(const Scales& scales, const PhaseFieldOptions& phase, std::vector<Seed>& crystals);
   const char* name() const override { return "grains"; }
   void declare(amr::FieldTable& fields) override;
   void attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) override;
@@ -44,7 +45,7 @@ class Grains : public Module {
   void near_seed(const Seed& seed, double reach, F&& f) const;
 
   Scales scales_;
-  double band_;
+  PhaseFieldOptions phase_;
   std::vector<Seed>& crystals_;
   amr::CellField psi_, c_, grain_, grain_next_;
   Array<amr::CellField> shift_{}, shift_next_{};  // of the marker, W0

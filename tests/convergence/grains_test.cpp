@@ -52,8 +52,8 @@ TEST(Grains, BoundariesRideWithTheCrystals) {
     scene.advance_to(way / speed);
     std::map<int, double> after = volumes(scene);
     ASSERT_EQ(after.size(), 2U);
-    // Half a cell of a boundary 11 W0 long.
-    for (const int g : {0, 1}) EXPECT_NEAR(after[g], before[g], 6) << speed << " " << g;
+    // Half a cell of a boundary 11 W0 long, and what crystals gain or lose on the way.
+    for (const int g : {0, 1}) EXPECT_NEAR(after[g], before[g], 8) << speed << " " << g;
     for (const int g : {0, 1}) EXPECT_TRUE(scene->crystals()[static_cast<std::size_t>(g)].touching);
     EXPECT_EQ(scene->crystals()[0].contacts, 1);
   }
