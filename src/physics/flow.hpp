@@ -50,6 +50,7 @@ struct FlowOptions {
   int projections = 1;
   bool rotational = true;
   double tolerance = 1e-5;
+  double crystal_tolerance = 1e-3;
   int max_iterations = 300;
   int coarser_levels = 0;
   double courant = 0.5, max_interval_tau0 = 4, max_change = 0.05;
@@ -135,6 +136,7 @@ class Flow : public Module {
   }
   void set_force(double sigma);
   void add_inertia(int b);
+  double fastest() const;
   double unbalanced() const;
   Array<bool> unheld() const;
   RealVec means(const amr::HierarchyField& f) const;

@@ -125,10 +125,11 @@ Vector3 spin_of(const Vector3& l, const double* inertia) {
 
 }  // namespace
 
-std::vector<RealVec> net_forces(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain, const std::vector<Seed>& crystals,
-                                const std::function<const double*(int b, int axis)>& force) {
+std::vector<Load> net_loads(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain, const std::vector<Seed>& crystals,
+                            const std::function<const double*(int b, int axis)>& force) {
   const amr::Layout& layout = mesh.layout();
   const Solid solid(mesh, psi, grain, {}, crystals);
+  constexpr std::size_t WIDTH = DIM + 3;
   std::vector<std::vector<double>> parts(at(mesh.size()));
   amr::parallel_for(mesh.size(), [&](int b) {
     const amr::Block& block = mesh.block(b);
@@ -142,19 +143,28 @@ std::vector<RealVec> net_forces(const amr::Mesh& mesh, amr::CellField psi, amr::
       for (int a = 0; a < DIM; ++a) x[a] = block.lo[a] + (q[a] + 0.5) * block.dx;
       Sample s{};
       solid.find_crystal(x, b, o, s);
-      parts[at(b)].resize(DIM * crystals.size());
+      parts[at(b)].resize(WIDTH * crystals.size());
+      double* part = parts[at(b)].data() + s.crystal * WIDTH;
+      Vector3 f{};
       for (int a = 0; a < DIM; ++a) {
-        const double* f = force(b, a) + o;
-        parts[at(b)][s.crystal * DIM + at(a)] += half * (f[0] + f[layout.stride(a)]);
+        const double* of_faces = force(b, a) + o;
+        f[at(a)] = half * (of_faces[0] + of_faces[layout.stride(a)]);
+        part[a] += f[at(a)];
       }
+      // The arm across an axis is that of the cell's centre, for both of its faces.
+      const Vector3 torque = cross(s.r, f);
+      for (std::size_t a = 0; a < 3; ++a) part[DIM + a] += torque[a];
     });
   });
-  std::vector<amr::ExactSum> total(DIM * crystals.size());
+  std::vector<amr::ExactSum> total(WIDTH * crystals.size());
   for (const std::vector<double>& part : parts)
     for (std::size_t k = 0; k < part.size(); ++k) total[k].add(part[k]);
   const std::vector<double> sums = amr::exact_sums(total, mesh.comm());
-  std::vector<RealVec> net(crystals.size());
-  for (std::size_t g = 0; g < crystals.size(); ++g) std::copy_n(sums.data() + g * DIM, DIM, net[g].begin());
+  std::vector<Load> net(crystals.size());
+  for (std::size_t g = 0; g < crystals.size(); ++g) {
+    std::copy_n(sums.data() + g * WIDTH, DIM, net[g].force.begin());
+    std::copy_n(sums.data() + g * WIDTH + DIM, 3, net[g].torque.begin());
+  }
   return net;
 }
 

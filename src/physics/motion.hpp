@@ -16,9 +16,15 @@ namespace dendrift::physics {
 void measure_motion(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain, amr::FaceField velocity,
                     std::vector<Seed>& crystals);
 
-/// Net force on each crystal and the interface round it (phi > -.99), of a force per mass on faces: force(b, axis) points
+/// Net force and torque about the centre (2D: the last component), over the density of the melt.
+struct Load {
+  RealVec force{};
+  std::array<double, 3> torque{};
+};
+
+/// Load on each crystal and the interface round it (phi > -.99), of a force per mass on faces: force(b, axis) points
 /// at cell (0,0[,0]) of local block b. Collective, the same on any ranks.
-std::vector<RealVec> net_forces(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain, const std::vector<Seed>& crystals,
+std::vector<Load> net_loads(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain, const std::vector<Seed>& crystals,
                                 const std::function<const double*(int b, int axis)>& force);
 
 }  // namespace dendrift::physics

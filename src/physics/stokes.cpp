@@ -460,9 +460,19 @@ StokesResult StokesSolver::solve(double sigma) {
     finish(x, result);
     return result;
   }
+  return iterate(std::move(x), options_.tolerance);
+}
+
+StokesResult StokesSolver::improve(double tolerance) {
+  Vector x;
+  pack(state_, x);
+  return iterate(std::move(x), tolerance);
+}
+
+StokesResult StokesSolver::iterate(Vector x, double tolerance) {
   amr::GmresOptions o;
   o.max_iterations = options_.max_iterations;
-  o.tolerance = options_.tolerance;
+  o.tolerance = tolerance;
   const amr::GmresResult g = gmres_.solve(x, pieces_, o, [this](const Vector& now) { return size(now); });
   StokesResult result;
   result.iterations = g.iterations;
