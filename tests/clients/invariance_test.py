@@ -94,6 +94,26 @@ velocity_W0_tau0 = [4, 2]
     "2D flow on a coarser mesh": (dict(lines=0.5, steps=81, omega=0.4), SINKING + "coarser_levels = 1"),
     "2D flow, penalised": (dict(lines=0.5, steps=81, omega=0.4), SINKING + 'solid = "penalised"\ntolerance = 1e-7'),
     "2D flow, held": (dict(lines=0.5, steps=81, omega=0.4), SINKING + 'motion = "held"\ncoupling = "projection"'),
+    # crystals of several orientations that sink, touch, and appear later
+    "2D grains": (dict(lines=0.5, steps=81, omega=0.4), TALL + """
+[[seed]]
+position_W0 = [22, 80]
+radius_W0 = 8
+angle_deg = 20
+[[seed]]
+position_W0 = [40, 80]
+radius_W0 = 8
+angle_deg = 60
+[[seed]]
+position_W0 = [30, 30]
+radius_W0 = 5
+angle_deg = 70
+nucleation_time_tau0 = 2
+[flow]
+max_interval_tau0 = 0.4
+gravity_um_s2 = 3e9
+coarser_levels = 1
+"""),
     # melt that comes in, goes out and shears, and a crystal of another shape
     "2D shear": (dict(lines=0.5, steps=81, omega=0.4), TALL + """
 yhi = "open"
@@ -122,6 +142,17 @@ noise = 0.05
 position_W0 = [18.3, 3.1, 21.7]
 radius_W0 = 6
 euler_deg = [10, 30, 50]
+"""),
+    "3D grains": (dict(lines=0.2, steps=25, omega=0.3), MESH_3D + """
+[seeds]
+count = 3
+generator = 4
+radius_W0 = 6
+clearance_W0 = 2
+last_nucleation_time_tau0 = 1
+[flow]
+max_interval_tau0 = 0.4
+gravity_um_s2 = 3e9
 """),
     "3D drift": (dict(lines=0.2, steps=33, omega=0.2), MESH_3D + """
 xlo = "periodic"

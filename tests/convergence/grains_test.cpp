@@ -129,5 +129,71 @@ TEST(Grains, LaterSeeds) {
   EXPECT_GT(v.at(2), 1.05 * one / CHILDREN);
 }
 
+// A crystal too small to live: it goes, and the rest goes on.
+TEST(Grains, RemeltAndDisappear) {
+  const double m = DIM == 2 ? 32 : 16;
+  Scene scene(scene_text(DIM == 2 ? "[64, 64]" : "[32, 32, 32]", "symmetry",
+                         seed(vec_text(0.5 * m, 0.5 * m), 2.5, "angle_deg = 10") + seed(vec_text(2 * m, 2 * m), DIM == 2 ? 20 : 12) +
+                             "[alloy]\nsupersaturation = 0.02\n[flow]\nmax_interval_tau0 = 1\n"));
+  const double solute = scene->totals().solute_mean;
+  scene.advance_to(30);
+  std::map<int, double> v = volumes(scene);
+  EXPECT_LT(v[0], 1e-3);
+  EXPECT_GT(v[1], 100);
+  EXPECT_EQ(scene->crystals()[0].contacts, 0);
+  EXPECT_TRUE(std::isfinite(scene->crystals()[0].velocity[0]));
+  EXPECT_NEAR(scene->totals().solute_mean / solute, 1, 1e-13);
+}
+
+#if DENDRIFT_DIM == 2
+// Two crystals in touch, carried round for a thousand changes of the mesh.
+TEST(Grains, LabelsOutliveAThousandRegrids) {
+  Scene scene(scene_text("[64, 64]", "periodic",
+                         seed("[26, 32]", 8) + seed("[39, 32]", 7, "angle_deg = 45") +
+                             "[phase_field]\nfrozen = true\n[flow]\nvelocity_W0_tau0 = [1.3, -0.7]\n"),
+              {"mesh.max_regrid_steps=1"});
+  std::map<int, double> before = volumes(scene);
+  int changes = 0, blocks = 0;
+  for (int i = 0; i < 1000; ++i) {
+    scene->step(scene->max_dt());
+    changes += scene->mesh().tree().size() != blocks ? 1 : 0;
+    blocks = scene->mesh().tree().size();
+  }
+  EXPECT_GT(changes, 50);
+  std::map<int, double> after = volumes(scene);
+  ASSERT_EQ(after.size(), 2U);
+  for (const int g : {0, 1}) EXPECT_NEAR(after[g], before[g], 8) << g;
+}
+
+// 200 crystals that appear one after the other, wherever that is: at borders of blocks, of levels, beside each other.
+TEST(Grains, TwoHundred) {
+  Scene scene(scene_text("[768, 768]", "periodic",
+                         "[seeds]\ncount = 200\nradius_W0 = 5\nclearance_W0 = 8\nlast_nucleation_time_tau0 = 8\n[alloy]\nsupersaturation = 0.4\n"));
+  const double solute = scene->totals().solute_mean;
+  scene.advance_to(10);
+  int present = 0;
+  for (const physics::Seed& s : scene->crystals()) present += s.present ? 1 : 0;
+  EXPECT_GT(present, 150);
+  EXPECT_EQ(static_cast<int>(volumes(scene).size()), present);
+  EXPECT_NEAR(scene->totals().solute_mean / solute, 1, 1e-13);
+}
+
+// Seeds a W0 apart: of the same orientation, of nearly the same, and at 45 degrees.
+TEST(Grains, GrowTogether) {
+  std::map<double, double> solid;
+  for (const double angle : {0.0, 5.0, 45.0, 85.0}) {
+    Scene scene(scene_text("[96, 64]", "symmetry",
+                           seed("[39, 32]", 8) + seed("[56, 32]", 8, fmt::format("angle_deg = {}", angle)) +
+                               "[alloy]\nsupersaturation = 0.5\n"));
+    scene.advance_to(20);
+    EXPECT_EQ(scene->crystals()[0].contacts, 1) << angle;
+    solid[angle] = scene->totals().solid_fraction;
+    EXPECT_GT(solid[angle] * 96 * 64, 2 * std::numbers::pi * 64 * 1.05) << angle;
+  }
+  EXPECT_NEAR(solid[5], solid[85], 1e-10 * solid[5]);  // mirror images
+  EXPECT_NE(solid[0], solid[45]);
+}
+#endif
+
 }  // namespace
 }  // namespace dendrift::test
