@@ -97,7 +97,8 @@ void add_linear(const ArrayRef<double>& x, const ArrayRef<const double>& coarse,
   });
 }
 
-// dst, a quadrant of coarse faces, = means of the fine ones over both sides of their planes (1:2:1), side by side along them.
+// dst, a quadrant of coarse faces, = means of the fine ones over both sides of their planes (1:2:1), side by side
+// along them.
 void take_weighted(const ArrayRef<double>& dst, const ArrayRef<const double>& x, int normal, int n) {
   std::array<double, 64> line_array{};
   double* line = line_array.data() + 1;  // fine places -1 to n - 1
@@ -747,7 +748,8 @@ void Hierarchy::restrict_means(const HierarchyField& from, HierarchyField& to, i
   });
 }
 
-void Hierarchy::restrict_weighted(const std::function<Array<ArrayRef<const double>>(int)>& made, HierarchyField& to, int g) {
+void Hierarchy::restrict_weighted(const std::function<Array<ArrayRef<const double>>(int)>& made, HierarchyField& to,
+                                  int g) {
   const Grid& gr = grid(g);
   const int cells = gr.layout.n, half = cells / 2;
   const IntVec size = filled(half);
@@ -814,48 +816,36 @@ void Hierarchy::restrict_links(HierarchyField& f, int g) {
   });
 }
 
-void Hierarchy::restrict_viscosity(HierarchyField& f, int g) {
-  const Grid& gr = grid(g);
-  const Layout& layout = gr.layout;
-  const int nc = f.components();
+void Hierarchy::restrict_roots(HierarchyField& f, int g) {
+  const Layout& layout = grid(g).layout;
   const IntVec size = filled(layout.n / 2);
-  const auto quadrant = [&](int i, const ArrayRef<double>& dst, const IntVec& lo, int c) {
-    const double* nu = f.at(g, i, 0);
-    // Where the cells round a place begin: one lower along the two axes of an edge.
-    std::ptrdiff_t back = 0;
-    for (int a = 0; a < DIM; ++a)
-      for (int b = a + 1; b < DIM; ++b)
-        if (c > 0 && (DIM == 2 || c == a + b)) back = layout.stride(a) + layout.stride(b);
+  const auto local = [&](const Item& item) { return grid(g).nodes[at(item.src)].local; };
+  const auto place = [&](const Item& item) { return grid(g).nodes[at(item.src)].place; };
+  const auto quadrant = [&](int i, const ArrayRef<double>& dst, const IntVec& lo) {
+    const ArrayRef<const double> x = std::as_const(f).ref(g, i, 0);
     for_each_cell({}, size, [&](const IntVec& q) {
       IntVec fine{}, coarse{};
       for (int a = 0; a < DIM; ++a) {
         fine[a] = 2 * q[a];
         coarse[a] = lo[a] + q[a];
       }
-      const double* p = nu + layout.offset(fine) - back;
+      const double* p = x.at(fine);
       double sum = 0;
       for (int corner = 0; corner < CHILDREN; ++corner) {
         std::ptrdiff_t o = 0;
-        for (int a = 0; a < DIM; ++a) o += (corner >> a & 1) != 0 ? layout.stride(a) : 0;
+        for (int a = 0; a < DIM; ++a) o += (corner >> a & 1) != 0 ? x.stride[a] : 0;
         sum += std::sqrt(p[o]);
       }
-      sum /= CHILDREN;
-      *dst.at(coarse) = sum * sum;
+      *dst.at(coarse) = sum / CHILDREN * (sum / CHILDREN);
     });
   };
-  const auto local = [&](const Item& item) { return gr.nodes[at(item.src)].local; };
   run(
-      routes_[at(g)].to_parent, [&](const Item&) { return nc * volume(size); },
-      [&](const Item& item, double* p) {
-        for (int c = 0; c < nc; ++c, p += volume(size)) quadrant(local(item), packed_ref(p, size), {}, c);
-      },
+      routes_[at(g)].to_parent, [&](const Item&) { return volume(size); },
+      [&](const Item& item, double* p) { quadrant(local(item), packed_ref(p, size), {}); },
       [&](const Item& item, const double* p) {
-        for (int c = 0; c < nc; ++c, p += volume(size))
-          copy_box(f.ref(g + 1, item.dst, c), gr.nodes[at(item.src)].place, packed_ref(p, size), {}, size);
+        copy_box(f.ref(g + 1, item.dst, 0), place(item), packed_ref(p, size), {}, size);
       },
-      [&](const Item& item) {
-        for (int c = 0; c < nc; ++c) quadrant(local(item), f.ref(g + 1, item.dst, c), gr.nodes[at(item.src)].place, c);
-      });
+      [&](const Item& item) { quadrant(local(item), f.ref(g + 1, item.dst, 0), place(item)); });
 }
 
 void Hierarchy::restrict_made(const std::function<ArrayRef<const double>(int)>& array, HierarchyField& to, int g) {

@@ -73,8 +73,8 @@ void second_step_from_zero(Operator o, const double* x, const double* b, const d
 
 // The step after one from `before` to x.
 template <int K>
-void next_step(Operator o, const double* x, const double* before, const double* b, const double* inverse, double* __restrict y,
-               std::ptrdiff_t begin, std::ptrdiff_t end, double weight, double momentum) {
+void next_step(Operator o, const double* x, const double* before, const double* b, const double* inverse,
+               double* __restrict y, std::ptrdiff_t begin, std::ptrdiff_t end, double weight, double momentum) {
 #pragma omp simd
   for (std::ptrdiff_t q = begin; q < end; ++q)
     y[q] = x[q] + momentum * (x[q] - before[q]) + weight * inverse[q] * (b[q] - apply<K>(o, x, q));
@@ -313,10 +313,11 @@ void Multigrid::solve_bottom() {
   for_bottom([&](int i, int c, std::ptrdiff_t q, int k) { x_.at(g, i, c)[q] = bottom_values_[at(k)]; });
 }
 
-// Chebyshev iteration with the diagonal as preconditioner, on eigenvalues from 2/lowest to 2: a few multiply-adds a cell and
-// step, no colours. How many steps there will be does not matter to the first ones.
+// Chebyshev iteration with the diagonal as preconditioner, on eigenvalues from 2/lowest to 2: a few multiply-adds a
+// cell and step, no colours. How many steps there will be does not matter to the first ones.
 std::array<Multigrid::Step, Multigrid::MOST_STEPS> Multigrid::chebyshev() const {
-  const double hi = 2.0, lo = hi / options_.lowest, theta = 0.5 * (hi + lo), delta = 0.5 * (hi - lo), sigma = theta / delta;
+  const double hi = 2.0, lo = hi / options_.lowest, theta = 0.5 * (hi + lo), delta = 0.5 * (hi - lo);
+  const double sigma = theta / delta;
   std::array<Step, MOST_STEPS> steps{};
   steps[0].weight = 1 / theta;
   double rho = 1 / sigma;
@@ -328,8 +329,8 @@ std::array<Multigrid::Step, Multigrid::MOST_STEPS> Multigrid::chebyshev() const 
   return steps;
 }
 
-// Component c of x on the plane of faces beyond the last one of a node that no node of its level follows: what a step with
-// one layer of ghosts does not reach. `held`: what lies there, a coarser leaf's.
+// Component c of x on the plane of faces beyond the last one of a node that no node of its level follows: what a step
+// with one layer of ghosts does not reach. `held`: what lies there, a coarser leaf's.
 void Multigrid::close_top(int g, int i, int c, const double* held, double* x) const {
   const Component& component = x_.component(c);
   const int a = component.normal;
@@ -386,9 +387,10 @@ bool beside_coarser(const Grid::Node& n) {
 
 }  // namespace
 
-// Three steps from zero, from the right-hand side with two layers of ghosts; then the weighted means of what they leave, from
-// the result with two layers. The transpose of the interpolation, with which the cycle would be symmetric, spreads what stiff
-// solids leave into the melt along faces: a disc in a corner, ratio 1e6, took twice the iterations.
+// Three steps from zero, from the right-hand side with two layers of ghosts; then the weighted means of what they
+// leave, from the result with two layers. The transpose of the interpolation, with which the cycle would be
+// symmetric, spreads what stiff solids leave into the melt along faces: a disc in a corner, ratio 1e6, took twice the
+// iterations.
 void Multigrid::descend_in_threes(int g) {
   const auto [first, second, third] = chebyshev();
   const Layout& layout = h_.grid(g).layout;
@@ -408,8 +410,8 @@ void Multigrid::descend_in_threes(int g) {
       with_operator(x_, g, i, c, [&](const Operator& whole, auto kind) {
         of_scratch(whole, one, [&](const Operator& o) {
           for_each_slab(layout, grown(layout.n, 1), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
-            second_step_from_zero<decltype(kind)::value>(o, one.at(c), rhs_.at(g, i, c), inverse_.at(g, i, c), two.at(c), begin,
-                                                         end, second.weight, second.momentum);
+            second_step_from_zero<decltype(kind)::value>(o, one.at(c), rhs_.at(g, i, c), inverse_.at(g, i, c),
+                two.at(c), begin, end, second.weight, second.momentum);
           });
         });
         close_top(g, i, c, one.at(c), two.at(c));
@@ -420,8 +422,8 @@ void Multigrid::descend_in_threes(int g) {
       with_operator(x_, g, i, c, [&](const Operator& whole, auto kind) {
         of_scratch(whole, two, [&](const Operator& o) {
           for_each_slab(layout, own(g, i, c), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
-            next_step<decltype(kind)::value>(o, two.at(c), one.at(c), rhs_.at(g, i, c), inverse_.at(g, i, c), x_.at(g, i, c),
-                                             begin, end, third.weight, third.momentum);
+            next_step<decltype(kind)::value>(o, two.at(c), one.at(c), rhs_.at(g, i, c), inverse_.at(g, i, c),
+                                             x_.at(g, i, c), begin, end, third.weight, third.momentum);
           });
         });
       });
@@ -471,8 +473,8 @@ void Multigrid::ascend_in_threes(int g) {
     for (int c = 0; c < components; ++c)
       with_operator(x_, g, i, c, [&](const Operator& o, auto kind) {
         for_each_slab(layout, grown(layout.n, 1), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
-          first_step<decltype(kind)::value>(o, x_.at(g, i, c), rhs_.at(g, i, c), inverse_.at(g, i, c), one.at(c), begin, end,
-                                            first.weight);
+          first_step<decltype(kind)::value>(o, x_.at(g, i, c), rhs_.at(g, i, c), inverse_.at(g, i, c), one.at(c),
+              begin, end, first.weight);
         });
         close_top(g, i, c, x_.at(g, i, c), one.at(c));
       });
@@ -480,8 +482,8 @@ void Multigrid::ascend_in_threes(int g) {
       with_operator(x_, g, i, c, [&](const Operator& whole, auto kind) {
         of_scratch(whole, one, [&](const Operator& o) {
           for_each_slab(layout, own(g, i, c), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
-            second_step_kept<decltype(kind)::value>(o, one.at(c), rhs_.at(g, i, c), inverse_.at(g, i, c), x_.at(g, i, c),
-                                                    step_.at(g, i, c), begin, end, second.weight, second.momentum);
+            second_step_kept<decltype(kind)::value>(o, one.at(c), rhs_.at(g, i, c), inverse_.at(g, i, c),
+                                                    x_.at(g, i, c), step_.at(g, i, c), begin, end, second.weight, second.momentum);
           });
         });
       });
@@ -491,8 +493,8 @@ void Multigrid::ascend_in_threes(int g) {
     for (int c = 0; c < components; ++c)
       with_operator(x_, g, i, c, [&](const Operator& o, auto kind) {
         for_each_slab(layout, own(g, i, c), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
-          chebyshev_step<decltype(kind)::value>(o, x_.at(g, i, c), rhs_.at(g, i, c), inverse_.at(g, i, c), step_.at(g, i, c),
-                                                begin, end, third.weight, third.momentum);
+          chebyshev_step<decltype(kind)::value>(o, x_.at(g, i, c), rhs_.at(g, i, c), inverse_.at(g, i, c), step_.at(g,
+              i, c), begin, end, third.weight, third.momentum);
         });
       });
     for (int c = 0; c < components; ++c) {  // after all: components may be coupled

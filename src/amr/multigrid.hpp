@@ -36,9 +36,10 @@ struct MultigridOptions {
   BottomSolver bottom = BottomSolver::direct;
 };
 
-/// Chebyshev steps, two or three of them in one pass over a block from two layers of ghosts, so that memory is read once where
-/// steps and exchanges by themselves read it several times. One component in cells: two steps before and after the coarser
-/// grid, and fluxes of corrections match where levels meet. The components of a vector on faces: three.
+/// Chebyshev steps, two or three of them in one pass over a block from two layers of ghosts, so that memory is read
+/// once where steps and exchanges by themselves read it several times. One component in cells: two steps before and
+/// after the coarser grid, and fluxes of corrections match where levels meet. The components of a vector on faces:
+/// three.
 class Multigrid {
  public:
   /// Coefficients (of places below 0, and along 0 .. n) need two layers of ghosts on all grids.
