@@ -1,6 +1,7 @@
 #include "amr/hierarchy.hpp"
 
 #include <algorithm>
+#include <cmath>
 #include <map>
 #include <unordered_map>
 
@@ -92,6 +93,44 @@ void add_linear(const ArrayRef<double>& x, const ArrayRef<const double>& coarse,
         out[2 * i] += 0.75 * line[i] + 0.25 * line[i - 1];
         out[2 * i + 1] += 0.75 * line[i] + 0.25 * line[i + 1];
       }
+    }
+  });
+}
+
+// dst, a quadrant of coarse faces, = means of the fine ones over both sides of their planes (1:2:1), side by side
+// along them.
+void take_weighted(const ArrayRef<double>& dst, const ArrayRef<const double>& x, int normal, int n) {
+  std::array<double, 64> line_array{};
+  double* line = line_array.data() + 1;  // fine places -1 to n - 1
+  constexpr int MOST = 3;
+  struct Share {
+    int count;
+    std::array<int, MOST> place;
+    std::array<double, MOST> weight;
+  };
+  const auto shares = [](bool across, int coarse) {
+    return across ? Share{2, {2 * coarse, 2 * coarse + 1}, {0.5, 0.5}}
+                  : Share{3, {2 * coarse - 1, 2 * coarse, 2 * coarse + 1}, {0.25, 0.5, 0.25}};
+  };
+  for_each_row(filled(n / 2), [&](const IntVec& row) {
+    std::fill_n(line - 1, n + 1, 0.0);
+    const auto add = [&](const double* from, double weight) {
+      for (int i = -1; i < n; ++i) line[i] += weight * from[i];
+    };
+    const Share y = shares(normal != 1, row[1]);
+    for (std::size_t j = 0; j < at(y.count); ++j) {
+      const double* p = x.p + y.place[j] * x.stride[1];
+      if constexpr (DIM == 2) {
+        add(p, y.weight[j]);
+      } else {
+        const Share z = shares(normal != 2, row[2]);
+        for (std::size_t k = 0; k < at(z.count); ++k) add(p + z.place[k] * x.stride[2], y.weight[j] * z.weight[k]);
+      }
+    }
+    double* out = dst.at(row);
+    for (int i = 0; i < n / 2; ++i) {
+      const double* f = line + 2 * i;
+      out[i] = normal == 0 ? 0.25 * (f[-1] + f[1]) + 0.5 * f[0] : 0.5 * (f[0] + f[1]);
     }
   });
 }
@@ -709,15 +748,57 @@ void Hierarchy::restrict_means(const HierarchyField& from, HierarchyField& to, i
   });
 }
 
-void Hierarchy::restrict_weighted(const HierarchyField& from, HierarchyField& to, int g) {
-  restrict_by(from, to, g, [](const double* p, const Array<std::ptrdiff_t>& stride, int normal, bool no_below, bool no_above) {
-    if (normal < 0) return mean_across(p, stride, normal);
-    const std::ptrdiff_t s = stride[normal];
-    const double centre = mean_across(p, stride, normal);
-    const double below = no_below ? centre : mean_across(p - s, stride, normal);
-    const double above = no_above ? centre : mean_across(p + s, stride, normal);
-    return 0.5 * centre + 0.25 * (below + above);
-  });
+void Hierarchy::restrict_weighted(const std::function<Array<ArrayRef<const double>>(int)>& made, HierarchyField& to,
+                                  int g) {
+  const Grid& gr = grid(g);
+  const int cells = gr.layout.n, half = cells / 2;
+  const IntVec size = filled(half);
+  const auto local = [&](const Item& item) { return gr.nodes[at(item.src)].local; };
+  run(
+      routes_[at(g)].to_parent, [&](const Item&) { return DIM * volume(size); },
+      [&](const Item& item, double* p) {
+        const Array<ArrayRef<const double>> x = made(local(item));
+        for (int c = 0; c < DIM; ++c, p += volume(size)) take_weighted(packed_ref(p, size), x[c], c, cells);
+      },
+      [&](const Item& item, const double* p) {
+        for (int c = 0; c < DIM; ++c, p += volume(size))
+          copy_box(to.ref(g + 1, item.dst, c), gr.nodes[at(item.src)].place, packed_ref(p, size), {}, size);
+      },
+      [&](const Item& item) {
+        const Array<ArrayRef<const double>> x = made(local(item));
+        for (int c = 0; c < DIM; ++c) {
+          ArrayRef<double> dst = to.ref(g + 1, item.dst, c);
+          dst.p = dst.at(gr.nodes[at(item.src)].place);
+          take_weighted(dst, x[c], c, cells);
+        }
+      });
+  const auto flat = [&](const Item& item) {
+    IntVec s = size;
+    s[item.tag] = 1;
+    return s;
+  };
+  const auto plane = [&](const Item& item, const ArrayRef<double>& dst) {
+    const int a = item.tag;
+    const ArrayRef<const double> x = made(local(item))[a];
+    for_each_cell({}, flat(item), [&](const IntVec& q) {
+      IntVec fine{};
+      for (int b = 0; b < DIM; ++b) fine[b] = b == a ? cells : 2 * q[b];
+      const double* p = x.at(fine);
+      *dst.at(q) = 0.75 * mean_across(p, x.stride, a) + 0.25 * mean_across(p - x.stride[a], x.stride, a);
+    });
+  };
+  const auto target = [&](const Item& item) {
+    IntVec lo = gr.nodes[at(item.src)].place;
+    lo[item.tag] = 0;
+    ArrayRef<double> dst = to.ref(g + 1, item.dst, item.tag);
+    dst.p = dst.at(lo);
+    return dst;
+  };
+  run(
+      routes_[at(g)].to_plane, [&](const Item& item) { return volume(flat(item)); },
+      [&](const Item& item, double* p) { plane(item, packed_ref(p, flat(item))); },
+      [&](const Item& item, const double* p) { copy_box(target(item), {}, packed_ref(p, flat(item)), {}, flat(item)); },
+      [&](const Item& item) { plane(item, target(item)); });
 }
 
 void Hierarchy::restrict_links(HierarchyField& f, int g) {
@@ -733,6 +814,38 @@ void Hierarchy::restrict_links(HierarchyField& f, int g) {
     }
     return sum / (CHILDREN / 2);
   });
+}
+
+void Hierarchy::restrict_roots(HierarchyField& f, int g) {
+  const Layout& layout = grid(g).layout;
+  const IntVec size = filled(layout.n / 2);
+  const auto local = [&](const Item& item) { return grid(g).nodes[at(item.src)].local; };
+  const auto place = [&](const Item& item) { return grid(g).nodes[at(item.src)].place; };
+  const auto quadrant = [&](int i, const ArrayRef<double>& dst, const IntVec& lo) {
+    const ArrayRef<const double> x = std::as_const(f).ref(g, i, 0);
+    for_each_cell({}, size, [&](const IntVec& q) {
+      IntVec fine{}, coarse{};
+      for (int a = 0; a < DIM; ++a) {
+        fine[a] = 2 * q[a];
+        coarse[a] = lo[a] + q[a];
+      }
+      const double* p = x.at(fine);
+      double sum = 0;
+      for (int corner = 0; corner < CHILDREN; ++corner) {
+        std::ptrdiff_t o = 0;
+        for (int a = 0; a < DIM; ++a) o += (corner >> a & 1) != 0 ? x.stride[a] : 0;
+        sum += std::sqrt(p[o]);
+      }
+      *dst.at(coarse) = sum / CHILDREN * (sum / CHILDREN);
+    });
+  };
+  run(
+      routes_[at(g)].to_parent, [&](const Item&) { return volume(size); },
+      [&](const Item& item, double* p) { quadrant(local(item), packed_ref(p, size), {}); },
+      [&](const Item& item, const double* p) {
+        copy_box(f.ref(g + 1, item.dst, 0), place(item), packed_ref(p, size), {}, size);
+      },
+      [&](const Item& item) { quadrant(local(item), f.ref(g + 1, item.dst, 0), place(item)); });
 }
 
 void Hierarchy::restrict_made(const std::function<ArrayRef<const double>(int)>& array, HierarchyField& to, int g) {

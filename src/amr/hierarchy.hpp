@@ -142,8 +142,12 @@ class Hierarchy {
   void prolong_add_shared(HierarchyField& f, const HierarchyField& shares, int g);
   /// Parents in grid g+1 = means of grid g: of the cells, or of the faces that make up a face.
   void restrict_means(const HierarchyField& from, HierarchyField& to, int g);
-  /// Parents in grid g+1 = means of grid g, faces weighted over both sides of the plane as well (full weighting).
-  void restrict_weighted(const HierarchyField& from, HierarchyField& to, int g);
+  /// Parents in grid g+1 = means over the finer faces of a face and of the planes on both its sides (full weighting
+  /// along the normal alone), of a vector. made(local node): arrays of its components and of the plane below their
+  /// first faces, made when they are asked for.
+  void restrict_weighted(const std::function<Array<ArrayRef<const double>>(int i)>& made, HierarchyField& to, int g);
+  /// Component 0 (cells) of parents in grid g+1 = the square of the mean of the roots of the finer cells.
+  void restrict_roots(HierarchyField& f, int g);
   /// Faces of parents in grid g+1 as conductors: finer ones in series across the plane, side by side along it. Low planes of
   /// leaves take means, as restrict_means. Ghosts of grid g must be filled.
   void restrict_links(HierarchyField& f, int g);

@@ -71,6 +71,15 @@ void second_step_from_zero(Operator o, const double* x, const double* b, const d
     y[q] = (1 + momentum) * x[q] + weight * inverse[q] * (b[q] - apply<K>(o, x, q));
 }
 
+// The step after one from `before` to x.
+template <int K>
+void next_step(Operator o, const double* x, const double* before, const double* b, const double* inverse,
+               double* __restrict y, std::ptrdiff_t begin, std::ptrdiff_t end, double weight, double momentum) {
+#pragma omp simd
+  for (std::ptrdiff_t q = begin; q < end; ++q)
+    y[q] = x[q] + momentum * (x[q] - before[q]) + weight * inverse[q] * (b[q] - apply<K>(o, x, q));
+}
+
 template <int K>
 void first_step(Operator o, const double* x, const double* b, const double* inverse, double* __restrict y,
                 std::ptrdiff_t begin, std::ptrdiff_t end, double weight) {
@@ -85,6 +94,18 @@ void second_step(Operator o, const double* y, const double* b, const double* inv
 #pragma omp simd
   for (std::ptrdiff_t q = begin; q < end; ++q)
     x[q] = y[q] + momentum * (y[q] - x[q]) + weight * inverse[q] * (b[q] - apply<K>(o, y, q));
+}
+
+// The same, and d the step.
+template <int K>
+void second_step_kept(Operator o, const double* y, const double* b, const double* inverse, double* __restrict x,
+                      double* __restrict d, std::ptrdiff_t begin, std::ptrdiff_t end, double weight, double momentum) {
+#pragma omp simd
+  for (std::ptrdiff_t q = begin; q < end; ++q) {
+    const double step = momentum * (y[q] - x[q]) + weight * inverse[q] * (b[q] - apply<K>(o, y, q));
+    d[q] = step;
+    x[q] = y[q] + step;
+  }
 }
 
 Range grown(int n, int layers) { return {filled(-layers), filled(n + 2 * layers)}; }
@@ -116,9 +137,9 @@ void for_each_slab(const Layout& layout, const Range& box, F&& f) {
 
 Multigrid::Multigrid(Hierarchy& hierarchy, std::vector<Component> components, const HierarchyField& coefficients,
                      MultigridOptions options)
-    : h_(hierarchy), coefficients_(coefficients), options_(options),
+    : h_(hierarchy), coefficients_(coefficients), options_(options), scalar_(components.front().normal < 0),
       x_(hierarchy, components), rhs_(hierarchy, components), step_(hierarchy, components),
-      residual_(hierarchy, components), inverse_(hierarchy, options.in_pairs ? without_sides(components) : components),
+      inverse_(hierarchy, without_sides(components)),
       no_drag_(static_cast<std::size_t>(hierarchy.grid(0).layout.size()), 0.0) {}
 
 template <class F>
@@ -178,10 +199,8 @@ void Multigrid::prepare(std::vector<Links> links, const HierarchyField* drag) {
         });
     });
   // Ghosts as their own blocks have them; 0 where a coarser leaf lies, whose values no step may change.
-  if (options_.in_pairs) {
-    for (int g = 0; g < h_.grids(); ++g) h_.exchange(inverse_, g, Layout::GHOSTS);
-    prepare_shares();
-  }
+  for (int g = 0; g < h_.grids(); ++g) h_.exchange(inverse_, g, Layout::GHOSTS);
+  if (scalar_) prepare_shares();
   prepare_bottom();
 }
 
@@ -294,96 +313,218 @@ void Multigrid::solve_bottom() {
   for_bottom([&](int i, int c, std::ptrdiff_t q, int k) { x_.at(g, i, c)[q] = bottom_values_[at(k)]; });
 }
 
-// Chebyshev iteration with the diagonal as preconditioner: a few multiply-adds a cell and step, no colours.
-void Multigrid::smooth(int g, int steps, double lowest, bool from_zero) {
-  const double hi = 2.0, lo = hi / lowest, theta = 0.5 * (hi + lo), delta = 0.5 * (hi - lo), sigma = theta / delta;
+// Chebyshev iteration with the diagonal as preconditioner, on eigenvalues from 2/lowest to 2: a few multiply-adds a
+// cell and step, no colours. How many steps there will be does not matter to the first ones.
+std::array<Multigrid::Step, Multigrid::MOST_STEPS> Multigrid::chebyshev() const {
+  const double hi = 2.0, lo = hi / options_.lowest, theta = 0.5 * (hi + lo), delta = 0.5 * (hi - lo);
+  const double sigma = theta / delta;
+  std::array<Step, MOST_STEPS> steps{};
+  steps[0].weight = 1 / theta;
   double rho = 1 / sigma;
-  for (int k = 0; k < steps; ++k) {
-    const double next_rho = k == 0 ? rho : 1 / (2 * sigma - rho);
-    const double momentum = k == 0 ? 0.0 : next_rho * rho, weight = k == 0 ? 1 / theta : 2 * next_rho / delta;
-    rho = next_rho;
-    const bool zero = from_zero && k == 0;
-    if (!zero) h_.exchange(x_, g, 1);
-    const Layout& layout = h_.grid(g).layout;
-    parallel_for(h_.grid(g).size(), [&](int i) {
-      for (int c = 0; c < x_.components(); ++c) {
-        double *x = x_.at(g, i, c), *d = step_.at(g, i, c);
-        const double *r = rhs_.at(g, i, c), *inverse = inverse_.at(g, i, c);
-        const Range box = h_.unknowns(g, i, x_.component(c), false);
-        if (zero) {
-          for_each_slab(layout, box, [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
-#pragma omp simd
-            for (std::ptrdiff_t q = begin; q < end; ++q) x[q] = d[q] = weight * inverse[q] * r[q];
-          });
-        } else {
-          with_operator(x_, g, i, c, [&](const Operator& o, auto kind) {
-            for_each_slab(layout, box, [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
-              chebyshev_step<decltype(kind)::value>(o, x, r, inverse, d, begin, end, weight, momentum);
-            });
-          });
-        }
-      }
-      if (zero) return;
-      for (int c = 0; c < x_.components(); ++c) {  // after all: components may be coupled
-        double* x = x_.at(g, i, c);
-        const double* d = step_.at(g, i, c);
-        for_each_slab(layout, h_.unknowns(g, i, x_.component(c), false), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
-#pragma omp simd
-          for (std::ptrdiff_t q = begin; q < end; ++q) x[q] += d[q];
-        });
-      }
-    });
+  for (std::size_t k = 1; k < steps.size(); ++k) {
+    const double next = 1 / (2 * sigma - rho);
+    steps[k] = {2 * next / delta, next * rho};
+    rho = next;
   }
+  return steps;
 }
 
-// Also on the plane of faces below a node, which full weighting wants.
-void Multigrid::residual(int g) {
-  h_.exchange(x_, g, Layout::GHOSTS);
-  parallel_for(h_.grid(g).size(), [&](int i) {
-    const Grid::Node& n = h_.grid(g).mine(i);
-    for (int c = 0; c < x_.components(); ++c) {
-      const Component& component = x_.component(c);
-      Range box = h_.unknowns(g, i, component, false);
-      const double* x = x_.at(g, i, c);
-      const double* b = rhs_.at(g, i, c);
-      double* r = residual_.at(g, i, c);
-      if (const int a = component.normal; a >= 0) {
-        IntVec o{};
-        o[a] = -1;
-        if (n.neighbours[at(direction_index(o))] >= 0) {
-          --box.lo[a];
-          ++box.size[a];
-        }
-      }
-      with_operator(x_, g, i, c, [&](const Operator& o, auto kind) {
-        for_each_slab(h_.grid(g).layout, box, [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
-          residual_sweep<decltype(kind)::value>(o, x, b, r, begin, end);
+// Component c of x on the plane of faces beyond the last one of a node that no node of its level follows: what a step
+// with one layer of ghosts does not reach. `held`: what lies there, a coarser leaf's.
+void Multigrid::close_top(int g, int i, int c, const double* held, double* x) const {
+  const Component& component = x_.component(c);
+  const int a = component.normal;
+  const Grid::Node& n = h_.grid(g).mine(i);
+  IntVec o{};
+  o[a] = 1;
+  const int above = n.neighbours[at(direction_index(o))];
+  if (above >= 0) return;
+  const Layout& layout = h_.grid(g).layout;
+  Range plane = grown(layout.n, 1);
+  plane.lo[a] = layout.n + 1;
+  plane.size[a] = 1;
+  const bool mirrored = above == Grid::OUTSIDE && !component.sides[at(2 * a + 1)].odd;
+  for_each_cell_of(plane, [&](const IntVec& q) {
+    const std::ptrdiff_t p = layout.offset(q);
+    x[p] = mirrored ? x[p - 2 * layout.stride(a)] : held[p];
+  });
+}
+
+// The unknowns of a component and the faces of walls: whole rows.
+Range Multigrid::own(int g, int i, int c) const {
+  Range r = grown(h_.grid(g).layout.n, 0);
+  const int a = x_.component(c).normal;
+  const Range u = h_.unknowns(g, i, x_.component(c), false);
+  r.size[a] = u.lo[a] + u.size[a];
+  return r;
+}
+
+namespace {
+
+// Arrays of one node for every component, one thread's.
+struct Scratch {
+  std::vector<double> data;
+  std::ptrdiff_t size = 0, origin = 0;
+  void fit(const Layout& layout) {
+    size = layout.size();
+    origin = layout.interior();
+    if (data.size() < static_cast<std::size_t>(size * DIM)) data.resize(static_cast<std::size_t>(size * DIM));
+  }
+  double* at(int c) { return data.data() + c * size + origin; }
+};
+
+// As with_operator, but the other components are those of a scratch.
+template <class F>
+void of_scratch(Operator o, Scratch& s, F&& f) {
+  for (int a = 0; a < DIM; ++a)
+    if (o.other[a] != nullptr) o.other[a] = s.at(a);
+  f(o);
+}
+
+bool beside_coarser(const Grid::Node& n) {
+  return std::find(n.neighbours.begin(), n.neighbours.end(), Grid::COARSER) != n.neighbours.end();
+}
+
+}  // namespace
+
+// Three steps from zero, from the right-hand side with two layers of ghosts; then the weighted means of what they
+// leave, from the result with two layers. The transpose of the interpolation, with which the cycle would be
+// symmetric, spreads what stiff solids leave into the melt along faces: a disc in a corner, ratio 1e6, took twice the
+// iterations.
+void Multigrid::descend_in_threes(int g) {
+  const auto [first, second, third] = chebyshev();
+  const Layout& layout = h_.grid(g).layout;
+  h_.exchange(rhs_, g, Layout::GHOSTS);
+  parallel_for(h_.grid(g).size(), [&, first = first, second = second, third = third](int i) {
+    thread_local Scratch one, two;
+    one.fit(layout);
+    two.fit(layout);
+    const int components = x_.components();
+    for (int c = 0; c < components; ++c) {
+      const double *b = rhs_.at(g, i, c), *inverse = inverse_.at(g, i, c);
+      double* y = one.at(c);
+#pragma omp simd
+      for (std::ptrdiff_t q = -one.origin; q < one.size - one.origin; ++q) y[q] = first.weight * inverse[q] * b[q];
+    }
+    for (int c = 0; c < components; ++c)
+      with_operator(x_, g, i, c, [&](const Operator& whole, auto kind) {
+        of_scratch(whole, one, [&](const Operator& o) {
+          for_each_slab(layout, grown(layout.n, 1), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
+            second_step_from_zero<decltype(kind)::value>(o, one.at(c), rhs_.at(g, i, c), inverse_.at(g, i, c),
+                two.at(c), begin, end, second.weight, second.momentum);
+          });
         });
+        close_top(g, i, c, one.at(c), two.at(c));
+      });
+    // Nothing from the cycle before where coarser leaves lie.
+    if (beside_coarser(h_.grid(g).mine(i))) std::fill_n(x_.at(g, i, 0) - one.origin, components * one.size, 0.0);
+    for (int c = 0; c < components; ++c)
+      with_operator(x_, g, i, c, [&](const Operator& whole, auto kind) {
+        of_scratch(whole, two, [&](const Operator& o) {
+          for_each_slab(layout, own(g, i, c), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
+            next_step<decltype(kind)::value>(o, two.at(c), one.at(c), rhs_.at(g, i, c), inverse_.at(g, i, c),
+                                             x_.at(g, i, c), begin, end, third.weight, third.momentum);
+          });
+        });
+      });
+  });
+  h_.exchange(x_, g, Layout::GHOSTS);
+  h_.restrict_weighted([&](int i) { return residual_round(g, i); }, rhs_, g);
+}
+
+// What x_ leaves of one node, on the plane of faces below it as well: another node's, or as the first one's.
+Array<ArrayRef<const double>> Multigrid::residual_round(int g, int i) const {
+  thread_local Scratch left;
+  const Layout& layout = h_.grid(g).layout;
+  left.fit(layout);
+  Array<ArrayRef<const double>> result{};
+  for (int c = 0; c < x_.components(); ++c) {
+    double* r = left.at(c);
+    const int normal = x_.component(c).normal;
+    Range box = own(g, i, c);
+    --box.lo[normal];
+    ++box.size[normal];
+    with_operator(x_, g, i, c, [&](const Operator& o, auto kind) {
+      for_each_slab(layout, box, [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
+        residual_sweep<decltype(kind)::value>(o, x_.at(g, i, c), rhs_.at(g, i, c), r, begin, end);
+      });
+    });
+    result[c] = array_ref(static_cast<const double*>(r), layout);
+    IntVec below{};
+    below[normal] = -1;
+    if (h_.grid(g).mine(i).neighbours[at(direction_index(below))] >= 0) continue;
+    box.size[normal] = 1;
+    for_each_cell_of(box, [&](const IntVec& q) { r[layout.offset(q)] = r[layout.offset(q) + layout.stride(normal)]; });
+  }
+  return result;
+}
+
+// The same three steps after the correction.
+void Multigrid::ascend_in_threes(int g) {
+  const auto [first, second, third] = chebyshev();
+  const Layout& layout = h_.grid(g).layout;
+  const int components = x_.components();
+  h_.exchange(x_, g + 1, Layout::GHOSTS);
+  h_.prolong_add(x_, g);
+  h_.exchange(x_, g, Layout::GHOSTS);
+  parallel_for(h_.grid(g).size(), [&, first = first, second = second](int i) {
+    thread_local Scratch one;
+    one.fit(layout);
+    for (int c = 0; c < components; ++c)
+      with_operator(x_, g, i, c, [&](const Operator& o, auto kind) {
+        for_each_slab(layout, grown(layout.n, 1), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
+          first_step<decltype(kind)::value>(o, x_.at(g, i, c), rhs_.at(g, i, c), inverse_.at(g, i, c), one.at(c),
+              begin, end, first.weight);
+        });
+        close_top(g, i, c, x_.at(g, i, c), one.at(c));
+      });
+    for (int c = 0; c < components; ++c)
+      with_operator(x_, g, i, c, [&](const Operator& whole, auto kind) {
+        of_scratch(whole, one, [&](const Operator& o) {
+          for_each_slab(layout, own(g, i, c), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
+            second_step_kept<decltype(kind)::value>(o, one.at(c), rhs_.at(g, i, c), inverse_.at(g, i, c),
+                                                    x_.at(g, i, c), step_.at(g, i, c), begin, end, second.weight, second.momentum);
+          });
+        });
+      });
+  });
+  h_.exchange(x_, g, 1);
+  parallel_for(h_.grid(g).size(), [&, third = third](int i) {
+    for (int c = 0; c < components; ++c)
+      with_operator(x_, g, i, c, [&](const Operator& o, auto kind) {
+        for_each_slab(layout, own(g, i, c), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
+          chebyshev_step<decltype(kind)::value>(o, x_.at(g, i, c), rhs_.at(g, i, c), inverse_.at(g, i, c), step_.at(g,
+              i, c), begin, end, third.weight, third.momentum);
+        });
+      });
+    for (int c = 0; c < components; ++c) {  // after all: components may be coupled
+      double* x = x_.at(g, i, c);
+      const double* d = step_.at(g, i, c);
+      for_each_slab(layout, own(g, i, c), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
+#pragma omp simd
+        for (std::ptrdiff_t q = begin; q < end; ++q) x[q] += d[q];
       });
     }
   });
 }
 
-// What grid g has found changes what leaves of grid g+1 at its border still have to do.
-void Multigrid::couple(int g) {
-  const Grid& coarse = h_.grid(g + 1);
-  step_.clear(g + 1);
-  h_.restrict_means(x_, step_, g);
-  h_.exchange(step_, g + 1, 1);
-  parallel_for(coarse.size(), [&](int i) {
-    const Grid::Node& n = coarse.mine(i);
+// rhs_ -= A step_ on the leaves of grid g beside finer ones.
+void Multigrid::correct_border(int g) {
+  const Grid& grid = h_.grid(g);
+  parallel_for(grid.size(), [&](int i) {
+    const Grid::Node& n = grid.mine(i);
     if (n.leaf < 0) return;
     bool border = false;
     for (int f = 0; f < FACES; ++f) {
       const int m = n.neighbours[at(direction_index(face_offset(f)))];
-      border = border || (m >= 0 && coarse.nodes[at(m)].leaf < 0);
+      border = border || (m >= 0 && grid.nodes[at(m)].leaf < 0);
     }
     if (!border) return;
     for (int c = 0; c < x_.components(); ++c)
-      with_operator(step_, g + 1, i, c, [&](const Operator& o, auto kind) {
-        const double* x = step_.at(g + 1, i, c);
-        double* r = rhs_.at(g + 1, i, c);
-        rows(g + 1, h_.unknowns(g + 1, i, x_.component(c), true), [&](std::ptrdiff_t q0, int count) {
+      with_operator(step_, g, i, c, [&](const Operator& o, auto kind) {
+        const double* x = step_.at(g, i, c);
+        double* r = rhs_.at(g, i, c);
+        rows(g, h_.unknowns(g, i, x_.component(c), true), [&](std::ptrdiff_t q0, int count) {
 #pragma omp simd
           for (std::ptrdiff_t q = q0; q < q0 + count; ++q) r[q] -= apply<decltype(kind)::value>(o, x, q);
         });
@@ -391,18 +532,21 @@ void Multigrid::couple(int g) {
   });
 }
 
-Multigrid::Weights Multigrid::pair_weights() const {
-  const double hi = 2.0, lo = hi / options_.lowest, theta = 0.5 * (hi + lo), delta = 0.5 * (hi - lo), sigma = theta / delta;
-  const double rho = 1 / sigma, next = 1 / (2 * sigma - rho);
-  return {1 / theta, 2 * next / delta, next * rho};
+// What grid g has found changes what leaves of grid g+1 at its border still have to do.
+void Multigrid::couple(int g) {
+  if (!h_.leaves_from(g + 1)) return;
+  step_.clear(g + 1);
+  h_.restrict_means(x_, step_, g);
+  h_.exchange(step_, g + 1, 1);
+  correct_border(g + 1);
 }
 
 // Two steps from zero and the means of what they leave, all from the right-hand side with two layers of ghosts.
 void Multigrid::descend_in_pairs(int g) {
-  const auto [first, second, momentum] = pair_weights();
+  const auto [first, second, third] = chebyshev();
   const Layout& layout = h_.grid(g).layout;
   h_.exchange(rhs_, g, Layout::GHOSTS);
-  const auto steps = [&, first = first, second = second, momentum = momentum](int i) {
+  const auto steps = [&, first = first, second = second](int i) {
     thread_local std::vector<double> one_array, left_array;
     one_array.resize(static_cast<std::size_t>(h_.grid(0).layout.size()));
     left_array.resize(one_array.size());
@@ -413,10 +557,10 @@ void Multigrid::descend_in_pairs(int g) {
       constexpr int K = decltype(kind)::value;
       for_each_slab(layout, grown(layout.n, 2), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
 #pragma omp simd
-        for (std::ptrdiff_t q = begin; q < end; ++q) one[q] = first * inverse[q] * b[q];
+        for (std::ptrdiff_t q = begin; q < end; ++q) one[q] = first.weight * inverse[q] * b[q];
       });
       for_each_slab(layout, grown(layout.n, 1), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
-        second_step_from_zero<K>(o, one, b, inverse, x, begin, end, second, momentum);
+        second_step_from_zero<K>(o, one, b, inverse, x, begin, end, second.weight, second.momentum);
       });
       for_each_slab(layout, grown(layout.n, 0), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
         residual_sweep<K>(o, x, b, left, begin, end);
@@ -428,7 +572,7 @@ void Multigrid::descend_in_pairs(int g) {
 }
 
 void Multigrid::ascend_in_pairs(int g) {
-  const auto [first, second, momentum] = pair_weights();
+  const auto [first, second, third] = chebyshev();
   const Layout& layout = h_.grid(g).layout;
   h_.exchange(x_, g + 1, Layout::GHOSTS);
   if (shares_.components() > 0) {
@@ -437,7 +581,7 @@ void Multigrid::ascend_in_pairs(int g) {
     h_.prolong_add(x_, g);
   }
   h_.exchange(x_, g, Layout::GHOSTS);
-  parallel_for(h_.grid(g).size(), [&, first = first, second = second, momentum = momentum](int i) {
+  parallel_for(h_.grid(g).size(), [&, first = first, second = second](int i) {
     thread_local std::vector<double> one_array;
     one_array.resize(static_cast<std::size_t>(h_.grid(0).layout.size()));
     double *one = one_array.data() + layout.interior(), *x = x_.at(g, i, 0);
@@ -445,10 +589,10 @@ void Multigrid::ascend_in_pairs(int g) {
     with_operator(x_, g, i, 0, [&](const Operator& o, auto kind) {
       constexpr int K = decltype(kind)::value;
       for_each_slab(layout, grown(layout.n, 1), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
-        first_step<K>(o, x, b, inverse, one, begin, end, first);
+        first_step<K>(o, x, b, inverse, one, begin, end, first.weight);
       });
       for_each_slab(layout, grown(layout.n, 0), [&](std::ptrdiff_t begin, std::ptrdiff_t end) {
-        second_step<K>(o, one, b, inverse, x, begin, end, second, momentum);
+        second_step<K>(o, one, b, inverse, x, begin, end, second.weight, second.momentum);
       });
     });
   });
@@ -460,52 +604,27 @@ void Multigrid::couple_in_pairs(int g) {
   Array<int> kappa{};
   for (int a = 0; a < DIM; ++a) kappa[a] = links_[0].along[a].field;
   h_.match_fluxes(x_, step_, g, coefficients_, kappa);
-  const Grid& coarse = h_.grid(g + 1);
-  parallel_for(coarse.size(), [&](int i) {
-    const Grid::Node& n = coarse.mine(i);
-    if (n.leaf < 0) return;
-    bool border = false;
-    for (int f = 0; f < FACES; ++f) {
-      const int m = n.neighbours[at(direction_index(face_offset(f)))];
-      border = border || (m >= 0 && coarse.nodes[at(m)].leaf < 0);
-    }
-    if (!border) return;
-    with_operator(step_, g + 1, i, 0, [&](const Operator& o, auto kind) {
-      const double* x = step_.at(g + 1, i, 0);
-      double* r = rhs_.at(g + 1, i, 0);
-      rows(g + 1, grown(coarse.layout.n, 0), [&](std::ptrdiff_t q0, int count) {
-#pragma omp simd
-        for (std::ptrdiff_t q = q0; q < q0 + count; ++q) r[q] -= apply<decltype(kind)::value>(o, x, q);
-      });
-    });
-  });
+  correct_border(g + 1);
 }
 
 void Multigrid::cycle() {
   const int last = h_.grids() - 1;
-  if (options_.in_pairs) {
-    for (int g = 0; g < last; ++g) {
+  for (int g = 0; g < last; ++g) {
+    if (scalar_) {
       descend_in_pairs(g);
       if (g + 1 < h_.levels()) couple_in_pairs(g);
+    } else {
+      descend_in_threes(g);
+      if (g + 1 < h_.levels()) couple(g);
     }
-    solve_bottom();
-    for (int g = last - 1; g >= 0; --g) ascend_in_pairs(g);
-    return;
-  }
-  for (int g = 0; g < last; ++g) {
-    x_.clear(g);
-    smooth(g, options_.smoothings, options_.lowest, true);
-    // The plane below a node is another node's, whose right-hand side has to be there too.
-    h_.exchange(rhs_, g, 1);
-    residual(g);
-    h_.restrict_weighted(residual_, rhs_, g);
-    if (g + 1 < h_.levels()) couple(g);
   }
   solve_bottom();
   for (int g = last - 1; g >= 0; --g) {
-    h_.exchange(x_, g + 1, Layout::GHOSTS);
-    h_.prolong_add(x_, g);
-    smooth(g, options_.smoothings, options_.lowest, false);
+    if (scalar_) {
+      ascend_in_pairs(g);
+    } else {
+      ascend_in_threes(g);
+    }
   }
 }
 

@@ -3,6 +3,7 @@
 /// component with its own centring. Used as a preconditioner, so sides count as homogeneous.
 #pragma once
 
+#include <array>
 #include <cstdint>
 #include <memory>
 #include <vector>
@@ -31,17 +32,17 @@ struct Links {
 enum class BottomSolver : std::uint8_t { direct, hypre };
 
 struct MultigridOptions {
-  int smoothings = 4;       ///< Chebyshev steps before and after the coarser grid
-  double lowest = 8;        ///< they act on eigenvalues from 2/lowest to 2 of the diagonally scaled operator
+  double lowest = 6;  ///< smoothing acts on eigenvalues from 2/lowest to 2 of the diagonally scaled operator
   BottomSolver bottom = BottomSolver::direct;
-  /// Two steps before and after whatever `smoothings` says, each pair on a block with two layers of ghosts, so that
-  /// memory is read once where steps and exchanges by themselves read it six times; and fluxes of corrections match where
-  /// levels meet. For one component in cells whose coefficients (of places below 0) have ghosts on all grids.
-  bool in_pairs = false;
 };
 
+/// Chebyshev steps, two or three of them in one pass over a block from two layers of ghosts, so that memory is read
+/// once where steps and exchanges by themselves read it several times. One component in cells: two steps before and
+/// after the coarser grid, and fluxes of corrections match where levels meet. The components of a vector on faces:
+/// three.
 class Multigrid {
  public:
+  /// Coefficients (of places below 0, and along 0 .. n) need two layers of ghosts on all grids.
   Multigrid(Hierarchy& hierarchy, std::vector<Component> components, const HierarchyField& coefficients,
             MultigridOptions options = {});
 
@@ -55,16 +56,21 @@ class Multigrid {
   HierarchyField& solution() { return x_; }
 
  private:
-  void smooth(int g, int steps, double lowest, bool from_zero);
-  struct Weights {
-    double first, second, momentum;
+  struct Step {
+    double weight = 0, momentum = 0;
   };
-  Weights pair_weights() const;
+  static constexpr std::size_t MOST_STEPS = 3;
+  std::array<Step, MOST_STEPS> chebyshev() const;
   void descend_in_pairs(int g);
   void ascend_in_pairs(int g);
   void couple_in_pairs(int g);
-  void residual(int g);
+  void descend_in_threes(int g);
+  void ascend_in_threes(int g);
   void couple(int g);
+  void correct_border(int g);
+  void close_top(int g, int i, int c, const double* held, double* x) const;
+  Range own(int g, int i, int c) const;
+  Array<ArrayRef<const double>> residual_round(int g, int i) const;
   void prepare_shares();
   void prepare_bottom();
   void solve_bottom();
@@ -80,7 +86,8 @@ class Multigrid {
   const HierarchyField& coefficients_;
   std::vector<Links> links_;
   MultigridOptions options_;
-  HierarchyField x_, rhs_, step_, residual_, inverse_;  // step_ in pairs: 0 but for ghosts beside finer nodes
+  bool scalar_;  // one component in cells
+  HierarchyField x_, rhs_, step_, inverse_;  // step_ in pairs: 0 but for ghosts beside finer nodes
   HierarchyField shares_;  // in pairs, where a coefficient varies: see Hierarchy::prolong_add_shared
   const HierarchyField* drag_ = nullptr;
   std::vector<double> no_drag_;  // zeros for any block

@@ -20,7 +20,7 @@ struct ScalarOptions {
   double tolerance = 1e-10;  ///< true residual over the right-hand side, in the 2-norm and in the largest entry
   int max_iterations = 100;
   int directions = 2;        ///< of the Krylov method
-  MultigridOptions cycle{.lowest = 6, .in_pairs = true};
+  MultigridOptions cycle{};
 };
 
 struct ScalarResult {

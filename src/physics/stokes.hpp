@@ -78,6 +78,10 @@ class StokesSolver {
 
  private:
   using Vector = amr::Gmres::Vector;
+  /// f(phi of local block b).
+  template <class F>
+  void with_phase(int b, const std::function<void(int, double*)>& phase, F&& f) const;
+  void extend_viscosity(int g, int i);
   void set_up_pieces();
   std::vector<amr::Links> velocity_links(double sigma) const;
   void prepare_pressure();
