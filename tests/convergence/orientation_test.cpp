@@ -1,0 +1,243 @@
+// The field of angles: eq. (4) and what it does to eq. (1), against what is known of grain boundaries.
+#include <gtest/gtest.h>
+
+#include <functional>
+
+#include "amr/transfer.hpp"
+#include "physics/alloy_kernel.hpp"
+#include "physics/local_axes.hpp"
+#include "physics/orientation.hpp"
+#include "support/scene.hpp"
+
+namespace dendrift::test {
+namespace {
+
+using physics::RIGHT_ANGLE;
+constexpr double DEGREE = M_PI / 180;
+
+std::string crystal(double x, double y, double radius, double angle_deg) {
+  return "[[seed]]\nposition_W0 = [" + std::to_string(x) + ", " + std::to_string(y) + "]\nradius_W0 = " + std::to_string(radius) +
+         "\nangle_deg = " + std::to_string(angle_deg) + "\n";
+}
+
+// An alloy that hardly couples phase and solute: eqs. (1) and (4) alone. No anisotropy.
+const std::string PURE =
+    "[alloy]\nW0_over_d0 = 0.5\npartition_coefficient = 0.99\nsupersaturation = 1e-6\n[phase_field]\nanisotropy = 0\n";
+
+std::string box(double x, double y, int roots_x, int roots_y, const std::string& more = "") {
+  return "[run]\nend_time_tau0 = 1e6\n[mesh]\ndim = 2\nsize_W0 = [" + std::to_string(x) + ", " + std::to_string(y) +
+         "]\nblock_cells = 8\nlevels = 1\nroot_blocks = [" + std::to_string(roots_x) + ", " + std::to_string(roots_y) + "]\n" + more;
+}
+
+// f(psi, alpha, neighbours' differences) over all interior cells, ghosts filled.
+struct Cell {
+  const amr::Block* block;
+  IntVec index;
+  RealVec x;
+  std::ptrdiff_t q;
+};
+void each_cell(Scene& s, const std::function<void(int, const Cell&)>& f) {
+  amr::Mesh& mesh = s->mesh();
+  for (int b = 0; b < mesh.size(); ++b) {
+    const amr::Block& block = mesh.block(b);
+    amr::for_each_cell({}, filled(mesh.layout().n), [&](const IntVec& c) {
+      Cell cell{&block, c, {}, mesh.layout().offset(c)};
+      for (int a = 0; a < DIM; ++a) cell.x[a] = block.lo[a] + (c[a] + 0.5) * block.dx;
+      f(b, cell);
+    });
+  }
+}
+
+// All solid; two grains, which touch, where grain(x) says.
+void fill_with_solid(Scene& s, const std::function<int(const RealVec&)>& grain) {
+  for (physics::Seed& c : s->crystals()) c.touching = true;
+  each_cell(s, [&](int b, const Cell& c) {
+    const int g = grain(c.x);
+    s->mesh().cells(s->field("psi"), b)[c.q] = physics::PSI_MAX;
+    s->mesh().cells(s->field("grain"), b)[c.q] = g;
+    s->mesh().cells(s->field("alpha"), b)[c.q] = s->crystals()[static_cast<std::size_t>(g)].angle;
+    s->mesh().cells(s->field("c"), b)[c.q] = physics::c_of_u(0, 1, s.settings.scales.k);
+  });
+}
+
+struct Boundary {
+  double energy = 0, least_phi = 1, total = 0;  // total: of |grad alpha|, per length of the boundary
+};
+
+// Of a slab across x, per length in y.
+Boundary measure(Scene& s, double width) {
+  amr::Mesh& mesh = s->mesh();
+  const amr::CellField psi = s->field("psi"), alpha = s->field("alpha");
+  s->ghosts().fill({psi, alpha});
+  Boundary m;
+  each_cell(s, [&](int b, const Cell& c) {
+    const double* p = mesh.cells(psi, b) + c.q;
+    const double* a = mesh.cells(alpha, b) + c.q;
+    const double dx = c.block->dx, area = dx * dx / width;
+    const double phi = physics::phi_of_psi(p[0]);
+    m.least_phi = std::min(m.least_phi, phi);
+    double energy = 0.25 * (1 - phi * phi) * (1 - phi * phi);
+    for (int axis = 0; axis < DIM; ++axis) {
+      const std::ptrdiff_t t = mesh.layout().stride(axis);
+      const double dphi = (physics::phi_of_psi(p[t]) - phi) / dx;
+      const double dalpha = std::abs(amr::wrapped(a[t] - a[0], RIGHT_ANGLE)) / dx;
+      const double f = 0.5 * (1 + physics::phi_of_psi(0.5 * (p[t] + p[0])));
+      energy += 0.5 * dphi * dphi + f * f * (physics::Disorder::s * dalpha + 0.5 * physics::Disorder::e * physics::Disorder::e * dalpha * dalpha);
+      m.total += dalpha * area;
+    }
+    m.energy += energy * area;
+  });
+  return m;
+}
+
+struct Slab : Scene {
+  Slab(double degrees, double dx, const std::string& law)
+      : Scene(box(64 * dx, 8 * dx, 8, 1, PURE + "[orientation]\nP = \"" + law + "\"\n" + crystal(16 * dx, 4 * dx, 4, 0) +
+                                             crystal(48 * dx, 4 * dx, 4, degrees))) {
+    fill_with_solid(*this, [&](const RealVec& x) { return x[0] < 32 * dx ? 0 : 1; });
+  }
+};
+
+// A profile near that of rest: the shape of the boundary relaxes slowly, its energy hardly depends on it.
+TEST(Orientation, EnergyOfABoundary) {
+  if (DIM == 3) return;
+  struct Case {
+    double degrees, energy, phi;
+  };
+  for (const Case& known : {Case{5, .077, .989}, Case{15, .241, .966}, Case{30, .485, .927}, Case{44, .709, .885}}) {
+    const double dx = 0.8, middle = 32 * dx;
+    Slab s(known.degrees, dx, "warren");
+    each_cell(s, [&](int b, const Cell& c) {
+      constexpr double WIDTH = 2.3;
+      s->mesh().cells(s->field("alpha"), b)[c.q] = known.degrees * DEGREE * 0.5 * (1 + std::tanh(2 * (c.x[0] - middle) / WIDTH));
+    });
+    s.advance_to(10);
+    const Boundary m = measure(s, 8 * dx);
+    EXPECT_NEAR(m.energy, known.energy, 0.01) << known.degrees;
+    EXPECT_NEAR(m.least_phi, known.phi, 0.005) << known.degrees;
+    // Both grains turn into each other at about 300 degrees W0 per 1000 tau0, times contact length over area.
+    s.advance_to(30);
+    const double drift = (m.total - measure(s, 8 * dx).total) / DEGREE / 20 * 1000, expected = 2 * 300 / middle;
+    std::printf("%g degrees: energy %.4f phi %.4f, turning %.3g degrees per 1000 tau0, expected %.3g\n", known.degrees, m.energy,
+                m.least_phi, drift, expected);
+  }
+}
+
+// Area of the cells nearer to the angle of crystal 1 than to that of crystal 0.
+double embedded_area(Scene& s) {
+  double area = 0;
+  each_cell(s, [&](int b, const Cell& c) {
+    const double alpha = s->mesh().cells(s->field("alpha"), b)[c.q];
+    const auto away = [&](std::size_t g) { return std::abs(amr::wrapped(alpha - s->crystals()[g].angle, RIGHT_ANGLE)); };
+    if (away(1) < away(0)) area += c.block->dx * c.block->dx;
+  });
+  return area;
+}
+
+TEST(Orientation, EmbeddedGrain) {
+  if (DIM == 3) return;
+  const double side = 96 * 0.8, radius = 20;
+  for (const char* law : {"constant", "warren"}) {
+    Scene s(box(side, side, 12, 12, PURE + "[orientation]\nP = \"" + law + "\"\n" + crystal(4, 4, 3, 0) +
+                                        crystal(side / 2, side / 2, 5, 30)));
+    fill_with_solid(s, [&](const RealVec& x) { return std::hypot(x[0] - side / 2, x[1] - side / 2) < radius ? 1 : 0; });
+    const double before = embedded_area(s);
+    for (double t : {1., 2., 4., 6., 8., 10., 15., 20., 40., 100., 200., 400.}) {
+      s.advance_to(t);
+      const double a = embedded_area(s);
+      std::printf("%s t %g radius %.3f of %.3f\n", law, t, std::sqrt(a / M_PI), std::sqrt(before / M_PI));
+      if (a == 0) break;
+    }
+  }
+}
+
+TEST(Orientation, EightyFiveDegreesAreMinusFive) {
+  if (DIM == 3) return;
+  Slab large(85, 0.8, "constant"), small(-5, 0.8, "constant");
+  double most = 0, least_phi = 1;
+  for (Slab* s : {&large, &small}) s->advance_to(20);
+  each_cell(large, [&](int b, const Cell& c) {
+    const auto at = [&](Slab& s, const char* name) { return s->mesh().cells(s->field(name), b)[c.q]; };
+    most = std::max(most, std::abs(amr::wrapped(at(large, "alpha") - at(small, "alpha"), RIGHT_ANGLE)));
+    const double phi = physics::phi_of_psi(at(large, "psi"));
+    most = std::max(most, std::abs(phi - physics::phi_of_psi(at(small, "psi"))));
+    least_phi = std::min(least_phi, phi);
+  });
+  EXPECT_LT(most, 1e-11);
+  EXPECT_LT(least_phi, 0.99) << "without a boundary there is nothing to compare";
+}
+
+// Where the melt holds another angle, solid that grows into it carries on its own.
+TEST(Orientation, GrowthKeepsTheAngle) {
+  if (DIM == 3) return;
+  Scene s(box(64, 64, 8, 8, "[alloy]\nsupersaturation = 0.6\n[orientation]\n" + crystal(32, 32, 8, 17)));
+  const double own = s->crystals()[0].angle;
+  s->crystals()[0].touching = true;
+  s->crystals()[0].angle += 0.4;  // what the melt is given
+  const double before = s->totals().solid_fraction;
+  s.advance_to(30);
+  EXPECT_GT(s->totals().solid_fraction, 3 * before);
+  int solid = 0, other = 0;
+  each_cell(s, [&](int b, const Cell& c) {
+    if (physics::phi_of_psi(s->mesh().cells(s->field("psi"), b)[c.q]) <= -0.99) return;
+    ++solid;
+    if (s->mesh().cells(s->field("alpha"), b)[c.q] != own) ++other;
+  });
+  EXPECT_GT(solid, 1000);
+  EXPECT_EQ(other, 0);
+}
+
+TEST(Orientation, RigidTurn) {
+  if (DIM == 3) return;
+  for (const bool touching : {false, true}) {
+    Scene s(box(64, 64, 8, 8, "[phase_field]\nfrozen = true\n[flow]\nvelocity_gradient_per_tau0 = [0, -0.02, 0.02, 0]\n[orientation]\n" +
+                                  crystal(32, 32, 12, 10)));
+    s->crystals()[0].touching = touching;
+    s.advance_to(30 * DEGREE / 0.02);
+    double most = 0;
+    int other = 0;
+    each_cell(s, [&](int b, const Cell& c) {
+      if (physics::phi_of_psi(s->mesh().cells(s->field("psi"), b)[c.q]) <= -0.99) return;
+      const double alpha = s->mesh().cells(s->field("alpha"), b)[c.q];
+      most = std::max(most, std::abs(alpha - 40 * DEGREE));
+      if (alpha != s->crystals()[0].angle) ++other;
+    });
+    EXPECT_LT(most, 1e-10) << touching;
+    EXPECT_TRUE(touching || other == 0) << other << " cells that do not have the very angle of their crystal";
+  }
+}
+
+// The solid turns, the melt is at rest: the shear between belongs to neither.
+TEST(Orientation, SpinningDisc) {
+  if (DIM == 3) return;
+  constexpr double RATE = 0.02, RADIUS = 14;
+  Scene s(box(51.2, 51.2, 8, 8, "[phase_field]\nfrozen = true\n[flow]\nvelocity_W0_tau0 = [0, 0]\n[orientation]\n" +
+                                    crystal(25.6, 25.6, RADIUS, 0)));
+  s->crystals()[0].touching = true;
+  amr::Mesh& mesh = s->mesh();
+  for (int b = 0; b < mesh.size(); ++b)
+    for (int axis = 0; axis < DIM; ++axis) {
+      double* v = mesh.faces({s->field("velocity_x").id}, axis, b);
+      amr::for_each_cell(filled(-amr::Layout::GHOSTS), filled(mesh.layout().pitch()), [&](const IntVec& q) {
+        const amr::Block& block = mesh.block(b);
+        const double x = block.lo[0] + (q[0] + (axis == 0 ? 0.0 : 0.5)) * block.dx - 25.6;
+        const double y = block.lo[1] + (q[1] + (axis == 1 ? 0.0 : 0.5)) * block.dx - 25.6;
+        const double depth = std::clamp((RADIUS - std::hypot(x, y) + 3) / 4, 0.0, 1.0);  // 1 from phi = .61 on
+        v[mesh.layout().offset(q)] = RATE * depth * depth * (3 - 2 * depth) * (axis == 0 ? -y : x);
+      });
+    }
+  const double turn = 60 * DEGREE;
+  s.advance_to(turn / RATE);
+  double most = 0;
+  each_cell(s, [&](int b, const Cell& c) {
+    if (physics::phi_of_psi(mesh.cells(s->field("psi"), b)[c.q]) <= -0.99) return;
+    most = std::max(most, std::abs(amr::wrapped(mesh.cells(s->field("alpha"), b)[c.q] - turn, RIGHT_ANGLE)));
+  });
+  EXPECT_LT(most, 0.005 * turn);
+  std::printf("spinning disc: %.3g %%\n", 100 * most / turn);
+}
+
+// The solver's zeroth-order term that differs from cell to cell, across levels, is tested in scalar_solver_test.
+
+}  // namespace
+}  // namespace dendrift::test
