@@ -317,6 +317,8 @@ void Orientation::relax(double dt) {
   if (solver_ == nullptr || solver_generation_ != mesh_->generation()) {
     amr::ScalarOptions o;
     o.tolerance = options_.tolerance;
+    o.directions = 20;  // diffusivities differ by a factor of up to 1e6
+    o.max_iterations = 200;
     solver_ = std::make_unique<amr::ScalarSolver>(*mesh_, std::array<amr::MirrorRule, FACES>{}, o);
     solver_generation_ = mesh_->generation();
   }

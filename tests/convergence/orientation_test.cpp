@@ -61,7 +61,7 @@ void fill_with_solid(Scene& s, const std::function<int(const RealVec&)>& grain) 
 }
 
 struct Boundary {
-  double energy = 0, least_phi = 1, total = 0;  // total: of |grad alpha|, per length of the boundary
+  double energy = 0, least_phi = 1, turn = 0;  // turn: how far the two sides differ
 };
 
 // Of a slab across x, per length in y.
@@ -83,7 +83,7 @@ Boundary measure(Scene& s, double width) {
       const double dalpha = std::abs(amr::wrapped(a[t] - a[0], RIGHT_ANGLE)) / dx;
       const double f = 0.5 * (1 + physics::phi_of_psi(0.5 * (p[t] + p[0])));
       energy += 0.5 * dphi * dphi + f * f * (physics::Disorder::s * dalpha + 0.5 * physics::Disorder::e * physics::Disorder::e * dalpha * dalpha);
-      m.total += dalpha * area;
+      m.turn += dalpha * area;
     }
     m.energy += energy * area;
   });
@@ -91,8 +91,8 @@ Boundary measure(Scene& s, double width) {
 }
 
 struct Slab : Scene {
-  Slab(double degrees, double dx, const std::string& law)
-      : Scene(box(64 * dx, 8 * dx, 8, 1, PURE + "[orientation]\nP = \"" + law + "\"\n" + crystal(16 * dx, 4 * dx, 4, 0) +
+  Slab(double degrees, double dx, const std::string& orientation)
+      : Scene(box(64 * dx, 8 * dx, 8, 1, PURE + "[orientation]\n" + orientation + "\n" + crystal(16 * dx, 4 * dx, 4, 0) +
                                              crystal(48 * dx, 4 * dx, 4, degrees))) {
     fill_with_solid(*this, [&](const RealVec& x) { return x[0] < 32 * dx ? 0 : 1; });
   }
@@ -106,7 +106,7 @@ TEST(Orientation, EnergyOfABoundary) {
   };
   for (const Case& known : {Case{5, .077, .989}, Case{15, .241, .966}, Case{30, .485, .927}, Case{44, .709, .885}}) {
     const double dx = 0.8, middle = 32 * dx;
-    Slab s(known.degrees, dx, "warren");
+    Slab s(known.degrees, dx, "P = \"warren\"");
     each_cell(s, [&](int b, const Cell& c) {
       constexpr double WIDTH = 2.3;
       s->mesh().cells(s->field("alpha"), b)[c.q] = known.degrees * DEGREE * 0.5 * (1 + std::tanh(2 * (c.x[0] - middle) / WIDTH));
@@ -114,12 +114,12 @@ TEST(Orientation, EnergyOfABoundary) {
     s.advance_to(10);
     const Boundary m = measure(s, 8 * dx);
     EXPECT_NEAR(m.energy, known.energy, 0.01) << known.degrees;
-    EXPECT_NEAR(m.least_phi, known.phi, 0.005) << known.degrees;
-    // Both grains turn into each other at about 300 degrees W0 per 1000 tau0, times contact length over area.
+    EXPECT_NEAR(m.least_phi, known.phi, 0.01) << known.degrees;
+    // Both grains turn towards each other, by some 300 degrees W0 per 1000 tau0 times contact length over area.
     s.advance_to(30);
-    const double drift = (m.total - measure(s, 8 * dx).total) / DEGREE / 20 * 1000, expected = 2 * 300 / middle;
-    std::printf("%g degrees: energy %.4f phi %.4f, turning %.3g degrees per 1000 tau0, expected %.3g\n", known.degrees, m.energy,
-                m.least_phi, drift, expected);
+    const double drift = (m.turn - measure(s, 8 * dx).turn) / DEGREE / 20 * 1000;
+    EXPECT_NEAR(drift, 2 * 300 / middle, 10) << known.degrees;
+    RecordProperty("energy_" + std::to_string(known.degrees), std::to_string(m.energy));
   }
 }
 
@@ -137,34 +137,57 @@ double embedded_area(Scene& s) {
 TEST(Orientation, EmbeddedGrain) {
   if (DIM == 3) return;
   const double side = 96 * 0.8, radius = 20;
-  for (const char* law : {"constant", "warren"}) {
-    Scene s(box(side, side, 12, 12, PURE + "[orientation]\nP = \"" + law + "\"\n" + crystal(4, 4, 3, 0) +
-                                        crystal(side / 2, side / 2, 5, 30)));
+  // With Warren's P shorter steps than usual, which coefficients from before would slow down.
+  for (const auto& [law, end] : {std::pair{"P = \"constant\"", 400.}, std::pair{"P = \"warren\"\nmax_dt_tau0 = 0.25", 6.}}) {
+    Scene s(box(side, side, 12, 12, PURE + "[orientation]\n" + law + "\n" + crystal(4, 4, 3, 0) + crystal(side / 2, side / 2, 5, 30)));
     fill_with_solid(s, [&](const RealVec& x) { return std::hypot(x[0] - side / 2, x[1] - side / 2) < radius ? 1 : 0; });
-    const double before = embedded_area(s);
-    for (double t : {1., 2., 4., 6., 8., 10., 15., 20., 40., 100., 200., 400.}) {
-      s.advance_to(t);
-      const double a = embedded_area(s);
-      std::printf("%s t %g radius %.3f of %.3f\n", law, t, std::sqrt(a / M_PI), std::sqrt(before / M_PI));
-      if (a == 0) break;
+    const double before = std::sqrt(embedded_area(s) / M_PI);
+    s.advance_to(end);
+    const double after = std::sqrt(embedded_area(s) / M_PI);
+    if (end > 100) {
+      EXPECT_NEAR(after, before, 1) << law;
+    } else {
+      EXPECT_EQ(after, 0) << law;
     }
   }
 }
 
 TEST(Orientation, EightyFiveDegreesAreMinusFive) {
   if (DIM == 3) return;
-  Slab large(85, 0.8, "constant"), small(-5, 0.8, "constant");
-  double most = 0, least_phi = 1;
+  // Solved well, so that no difference of rounding decides on one iteration more.
+  Slab large(85, 0.8, "tolerance = 1e-10"), small(-5, 0.8, "tolerance = 1e-10");
   for (Slab* s : {&large, &small}) s->advance_to(20);
+  double alpha_off = 0, phi_off = 0, least_phi = 1;
   each_cell(large, [&](int b, const Cell& c) {
     const auto at = [&](Slab& s, const char* name) { return s->mesh().cells(s->field(name), b)[c.q]; };
-    most = std::max(most, std::abs(amr::wrapped(at(large, "alpha") - at(small, "alpha"), RIGHT_ANGLE)));
     const double phi = physics::phi_of_psi(at(large, "psi"));
-    most = std::max(most, std::abs(phi - physics::phi_of_psi(at(small, "psi"))));
+    alpha_off = std::max(alpha_off, std::abs(amr::wrapped(at(large, "alpha") - at(small, "alpha"), RIGHT_ANGLE)));
+    phi_off = std::max(phi_off, std::abs(phi - physics::phi_of_psi(at(small, "psi"))));
     least_phi = std::min(least_phi, phi);
   });
-  EXPECT_LT(most, 1e-11);
+  EXPECT_LT(alpha_off, 1e-11);
+  EXPECT_LT(phi_off, 1e-9);
   EXPECT_LT(least_phi, 0.99) << "without a boundary there is nothing to compare";
+}
+
+// Two crystals grow together: a boundary with a dip of phi, not a gap, and cores that keep their angles.
+TEST(Orientation, CrystalsMeet) {
+  if (DIM == 3) return;
+  Scene s(box(64, 32, 8, 4, "[alloy]\nsupersaturation = 0.8\n" + crystal(19, 16, 12, 10) + crystal(45, 16, 12, 40)));
+  s.advance_to(20);
+  ASSERT_TRUE(s->crystals()[0].touching && s->crystals()[1].touching);
+  double least = 1, most_off = 0;
+  each_cell(s, [&](int b, const Cell& c) {
+    const double phi = physics::phi_of_psi(s->mesh().cells(s->field("psi"), b)[c.q]);
+    if (std::abs(c.x[1] - 16) < 4 && std::abs(c.x[0] - 32) < 12) least = std::min(least, phi);
+    const double alpha = s->mesh().cells(s->field("alpha"), b)[c.q];
+    for (int g = 0; g < 2; ++g)
+      if (std::hypot(c.x[0] - (g == 0 ? 19 : 45), c.x[1] - 16) < 8)
+        most_off = std::max(most_off, std::abs(alpha - (g == 0 ? 10 : 40) * DEGREE));
+  });
+  EXPECT_GT(least, 0.85);
+  EXPECT_LT(least, 0.95);
+  EXPECT_LT(most_off, 1.4 * DEGREE);
 }
 
 // Where the melt holds another angle, solid that grows into it carries on its own.
@@ -234,10 +257,16 @@ TEST(Orientation, SpinningDisc) {
     most = std::max(most, std::abs(amr::wrapped(mesh.cells(s->field("alpha"), b)[c.q] - turn, RIGHT_ANGLE)));
   });
   EXPECT_LT(most, 0.005 * turn);
-  std::printf("spinning disc: %.3g %%\n", 100 * most / turn);
 }
 
-// The solver's zeroth-order term that differs from cell to cell, across levels, is tested in scalar_solver_test.
+TEST(Orientation, InverseMobility) {
+  using physics::inverse_mobility;
+  using physics::Mobility;
+  EXPECT_DOUBLE_EQ(inverse_mobility(Mobility::warren, 0), 1875);
+  EXPECT_NEAR(inverse_mobility(Mobility::warren, 1e-3), 1, 1e-9);
+  EXPECT_DOUBLE_EQ(inverse_mobility(Mobility::constant, 1e-3), 1875);
+  EXPECT_DOUBLE_EQ(inverse_mobility(Mobility::printed, 0), -1875) << "ill-posed, as docs/equations.md says";
+}
 
 }  // namespace
 }  // namespace dendrift::test
