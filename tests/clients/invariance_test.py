@@ -50,7 +50,7 @@ radius_W0 = 5
 angle_deg = 20
 """),
     # two crystals of different angle that grow together and turn with the flow: the field of angles is carried and solved
-    "2D orientation": (dict(lines=1, steps=81, omega=0.6), """
+    "2D orientation": (dict(lines=0.5, steps=81, omega=0.35), """
 [mesh]
 dim = 2
 size_W0 = [128, 64]
