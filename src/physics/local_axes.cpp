@@ -17,10 +17,8 @@ bool uniform(const double* values, const amr::Layout& layout) {
   return std::all_of(p, p + layout.size(), [&](double x) { return x == *p; });
 }
 
-// Row i: crystal axis i. In 2D the angle decides; a crystal whose angle it is gives its axes, which may be exact.
-Array<RealVec> axes_of(double angle, const Seed& crystal) {
-  if constexpr (DIM == 3) return crystal.axes;
-  if (angle == crystal.angle) return crystal.axes;
+// Row i: crystal axis i, for a given turn in the plane.
+Array<RealVec> axes_of(double angle) {
   Array<RealVec> axes{};
   axes[0][0] = axes[1][1] = std::cos(angle);
   axes[0][1] = std::sin(angle);
@@ -39,9 +37,7 @@ void LocalAxes::attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) {
 
 void LocalAxes::update(const std::vector<Seed>& crystals) {
   if (!active()) return;
-  std::vector<amr::CellField> fields{grain_};
-  if (alpha_.id >= 0) fields.push_back(alpha_);
-  ghosts_->fill(fields);
+  ghosts_->fill({alpha_.id >= 0 ? alpha_ : grain_});
   blocks_.resize(at(mesh_->size()));
   amr::parallel_for(mesh_->size(), [&](int b) { prepare(b, crystals, blocks_[at(b)]); });
 }
@@ -53,7 +49,8 @@ void LocalAxes::prepare(int b, const std::vector<Seed>& crystals, Own& own) cons
   const auto crystal = [&](std::ptrdiff_t q) -> const Seed& { return crystals[static_cast<std::size_t>(grain[q])]; };
   own.arrays.clear();
   if (uniform(alpha != nullptr ? alpha : grain, layout)) {
-    own.axes = axes_of(alpha != nullptr ? *alpha : 0.0, crystal(0));
+    // A crystal whose angle it is gives its axes, which may be those of the mesh exactly.
+    own.axes = alpha == nullptr || *alpha == crystal(0).angle ? crystal(0).axes : axes_of(*alpha);
     own.rotated = false;
     for (int i = 0; i < DIM; ++i)
       for (int a = 0; a < DIM; ++a) own.rotated = own.rotated || own.axes[i][a] != (i == a ? 1.0 : 0.0);
@@ -63,7 +60,7 @@ void LocalAxes::prepare(int b, const std::vector<Seed>& crystals, Own& own) cons
   double* first = own.arrays.data() + layout.interior();
   amr::for_each_cell(filled(-1), filled(layout.n + 2), [&](const IntVec& cell) {
     const std::ptrdiff_t q = layout.offset(cell);
-    const Array<RealVec> axes = axes_of(alpha != nullptr ? alpha[q] : 0.0, crystal(q));
+    const Array<RealVec> axes = alpha == nullptr ? crystal(q).axes : axes_of(alpha[q]);
     for (int i = 0; i < DIM; ++i)
       for (int a = 0; a < DIM; ++a) first[(i * DIM + a) * layout.size() + q] = axes[i][a];
   });

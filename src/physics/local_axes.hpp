@@ -28,7 +28,7 @@ class LocalAxes {
  public:
   void attach(amr::Mesh& mesh, amr::GhostExchange& ghosts);
   bool active() const { return grain_.id >= 0; }
-  /// Collective; fills the ghosts of both fields.
+  /// Collective; fills the ghosts of the field that decides.
   void update(const std::vector<Seed>& crystals);
   bool mixed(int b) const { return active() && !blocks_[static_cast<std::size_t>(b)].arrays.empty(); }
   /// Hands the kernel what block b has of its own.

@@ -271,6 +271,9 @@ void Orientation::turn(double dt) {
 void Orientation::extend(amr::CellField values, double least, int layers, bool touching_only) {
   const amr::Layout& layout = mesh_->layout();
   const int n = layout.n;
+  std::array<std::ptrdiff_t, DIRECTIONS> around{};
+  for (int d = 0; d < DIRECTIONS; ++d)
+    for (int a = 0; a < DIM; ++a) around[at(d)] += direction_offset(d)[a] * layout.stride(a);
   for (int done = 0; done < layers; done += amr::Layout::GHOSTS) {
     if (done == 0) {
       ghosts_->fill({psi_, grain_, values});
@@ -295,9 +298,8 @@ void Orientation::extend(amr::CellField values, double least, int layers, bool t
           const std::ptrdiff_t q = layout.offset(cell);
           if (valid[q] != 0 || (touching_only && !free_cell(grain[q]))) return;
           double most = -2 * PSI_MAX;
-          for (int d = 0; d < DIRECTIONS; ++d) {
-            std::ptrdiff_t p = q;
-            for (int a = 0; a < DIM; ++a) p += direction_offset(d)[a] * layout.stride(a);
+          for (const std::ptrdiff_t way : around) {
+            const std::ptrdiff_t p = q + way;
             if (valid[p] != 1 || psi[p] <= most) continue;
             most = psi[p];
             value[q] = value[p];
@@ -425,9 +427,7 @@ double Orientation::set_system(int b, double dt, bool first) {
 }
 
 void Orientation::before_tagging() {
-  std::vector<amr::CellField> fields{grain_};
-  if (alpha_.id >= 0) fields.push_back(alpha_);
-  ghosts_->fill(fields);
+  if (alpha_.id >= 0) ghosts_->fill({alpha_});
 }
 
 // Boundaries between grains stay on the finest level.

@@ -259,6 +259,30 @@ TEST(Orientation, SpinningDisc) {
   EXPECT_LT(most, 0.005 * turn);
 }
 
+// Two crystals far from each other grow as each does alone, but for other time steps: every cell has the axes of its own.
+TEST(Orientation, EachCrystalHasItsOwnAxes) {
+  const std::string one = DIM == 2 ? "position_W0 = [24, 24]\nradius_W0 = 10\nangle_deg = 10\n"
+                                   : "position_W0 = [24, 24, 24]\nradius_W0 = 10\neuler_deg = [10, 20, 0]\n";
+  const std::string two = DIM == 2 ? "position_W0 = [72, 24]\nradius_W0 = 10\nangle_deg = 45\n"
+                                   : "position_W0 = [72, 24, 24]\nradius_W0 = 10\neuler_deg = [45, 0, 0]\n";
+  const std::string start = std::string("[run]\nend_time_tau0 = 100\n[mesh]\ndim = ") + (DIM == 2 ? "2" : "3") +
+                            "\nsize_W0 = " + (DIM == 2 ? "[96, 48]" : "[96, 48, 48]") + "\ndx_W0 = 1.5\nblock_cells = 8\n";
+  Scene pair(start + "[[seed]]\n" + one + "[[seed]]\n" + two);
+  Scene first(start + "[[seed]]\n" + one), second(start + "[[seed]]\n" + two);
+  for (Scene* s : {&pair, &first, &second}) s->advance_to(DIM == 2 ? 6 : 3);
+  EXPECT_FALSE(first->mesh().fields().find("grain").has_value()) << "one crystal needs no field";
+  std::vector<physics::Tip> alone = first->tips();
+  const std::vector<physics::Tip> other = second->tips(), together = pair->tips();
+  alone.insert(alone.end(), other.begin(), other.end());
+  ASSERT_EQ(together.size(), alone.size());
+  for (std::size_t i = 0; i < alone.size(); ++i) EXPECT_NEAR(together[i].length, alone[i].length, 3e-4 * alone[i].length) << i;
+  EXPECT_LT(std::abs(pair->solute_drift(pair->totals())), 1e-13);
+  // The wrong axes would show.
+  Scene wrong(start + "[phase_field]\nanisotropy = 0\n[[seed]]\n" + one);
+  wrong.advance_to(DIM == 2 ? 6 : 3);
+  EXPECT_GT(std::abs(wrong->tips()[0].length - alone[0].length), 1e-3 * alone[0].length);
+}
+
 TEST(Orientation, InverseMobility) {
   using physics::inverse_mobility;
   using physics::Mobility;
