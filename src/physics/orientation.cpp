@@ -34,15 +34,23 @@ double limited_part(double behind, double ahead) {
 }  // namespace
 
 void OrientationOptions::declare(io::Schema& schema) {
-  io::Table& t = schema.table("orientation", "angles of crystals that touch, eq. (4); on by itself where crystals have several orientations");
+  io::Table& t = schema.table("orientation", "angles of crystals that touch, eq. (4); on by itself where crystals have "
+                                             "several orientations");
   t.choice("P", p, {{"constant", Mobility::constant}, {"warren", Mobility::warren}, {"printed", Mobility::printed}})
-      .doc("inverse mobility of the angle: mu/e everywhere; 1-(1-mu/e) exp(-beta w), with which boundaries sweep whole grains");
-  t.real("max_dt_tau0", max_dt_tau0).unit("tau0").above(0).at_most(10).doc("longest time between two solutions of eq. (4)");
+      .doc("inverse mobility of the angle: mu/e everywhere; 1-(1-mu/e) exp(-beta w), with which boundaries sweep whole "
+           "grains");
+  t.real("max_dt_tau0", max_dt_tau0)
+      .unit("tau0")
+      .above(0)
+      .at_most(10)
+      .doc("time between two solutions of eq. (4); with warren .1 to .25 are advisable");
   t.real("tolerance", tolerance).range(1e-12, 0.1).doc("residual of a solution over the change it is to bring");
+  t.boolean("everywhere", everywhere).doc("eq. (4) in all crystals; otherwise one that touches no other has one exact angle");
   schema.check({"orientation"}, [this](io::Checks& checks) {
     if (p == Mobility::printed)
       checks.fail("orientation.P", "constant or warren: the printed P = 1-(1+mu/e) exp(-beta w) is negative where the "
-                                   "orientation is uniform, so that disturbances grow the faster the shorter they are", "printed");
+                                   "orientation is uniform, so that disturbances grow the faster the shorter they are",
+                  "printed");
   });
 }
 
@@ -55,7 +63,8 @@ double inverse_mobility(Mobility law, double w) {
   return MU_OVER_E;
 }
 
-Orientation::Orientation(const OrientationOptions& options, std::vector<Seed>& crystals) : options_(options), crystals_(crystals) {}
+Orientation::Orientation(const OrientationOptions& options, std::vector<Seed>& crystals)
+    : options_(options), crystals_(crystals) {}
 
 void Orientation::declare(amr::FieldTable& fields) {
   amr::FieldSpec grain;
@@ -99,7 +108,16 @@ void Orientation::attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) {
 
 void Orientation::initialize() {
   label_nearest_seed();
-  if constexpr (DIM == 2) impose(crystals_);
+  if constexpr (DIM == 3) return;
+  // In all cells, the solid included.
+  const amr::Layout& layout = mesh_->layout();
+  amr::parallel_for(mesh_->size(), [&](int b) {
+    const double* grain = mesh_->cells(grain_, b);
+    double* alpha = mesh_->cells(alpha_, b);
+    amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
+      alpha[layout.offset(cell)] = crystals_[static_cast<std::size_t>(grain[layout.offset(cell)])].angle;
+    });
+  });
 }
 
 // Stands in for a module that labels grains as they move and grow.
@@ -157,7 +175,7 @@ void Orientation::impose(const std::vector<Seed>& crystals) {
     amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
       const std::ptrdiff_t q = layout.offset(cell);
       const Seed& crystal = crystals[static_cast<std::size_t>(grain[q])];
-      if (!crystal.touching || psi[q] <= LIQUID) alpha[q] = crystal.angle;
+      if (!free(crystal) || psi[q] <= LIQUID) alpha[q] = crystal.angle;
     });
   });
 }
@@ -167,8 +185,7 @@ void Orientation::advance(double, double dt, std::int64_t) {
   if constexpr (DIM == 3) return;
   std::vector<Seed> moved = crystals_;  // where they are at the end of the step
   for (Seed& s : moved) s.advance(dt);
-  const bool touching = std::any_of(moved.begin(), moved.end(), [](const Seed& s) { return s.touching; });
-  if (!touching) {
+  if (std::none_of(moved.begin(), moved.end(), [&](const Seed& s) { return free(s); })) {
     elapsed_ = 0;
     impose(moved);
     return;
@@ -255,7 +272,8 @@ void Orientation::turn(double dt) {
     });
   });
   const double interface = CORE - LIQUID;
-  extend(vorticity, CORE, static_cast<int>(std::ceil(interface / mesh_->shape().dx(mesh_->shape().max_level))) + 2, false);
+  const double finest = mesh_->shape().dx(mesh_->shape().max_level);
+  extend(vorticity, CORE, static_cast<int>(std::ceil(interface / finest)) + 2, false);
   amr::parallel_for(mesh_->size(), [&](int b) {
     const double* w = mesh_->cells(vorticity, b);
     double* alpha = mesh_->cells(alpha_, b);
@@ -266,9 +284,9 @@ void Orientation::turn(double dt) {
   });
 }
 
-// Cells below `least` copy the value of that neighbour with a value which has the largest psi, layer by layer. Two layers
-// of ghosts allow two layers at a time.
-void Orientation::extend(amr::CellField values, double least, int layers, bool touching_only) {
+// Cells below `least` copy the value of that neighbour with a value which has the largest psi, layer by layer. Two
+// layers of ghosts allow two layers at a time.
+void Orientation::extend(amr::CellField values, double least, int layers, bool free_only) {
   const amr::Layout& layout = mesh_->layout();
   const int n = layout.n;
   std::array<std::ptrdiff_t, DIRECTIONS> around{};
@@ -296,7 +314,7 @@ void Orientation::extend(amr::CellField values, double least, int layers, bool t
         const int rim = 1 - layer;
         amr::for_each_cell(filled(-rim), filled(n + 2 * rim), [&](const IntVec& cell) {
           const std::ptrdiff_t q = layout.offset(cell);
-          if (valid[q] != 0 || (touching_only && !free_cell(grain[q]))) return;
+          if (valid[q] != 0 || (free_only && !free_cell(grain[q]))) return;
           double most = -2 * PSI_MAX;
           for (const std::ptrdiff_t way : around) {
             const std::ptrdiff_t p = q + way;
@@ -309,7 +327,9 @@ void Orientation::extend(amr::CellField values, double least, int layers, bool t
         for (std::ptrdiff_t q = -layout.interior(); q < layout.size() - layout.interior(); ++q)
           valid[q] = static_cast<char>(valid[q] != 0);
       }
-      amr::for_each_cell({}, filled(n), [&](const IntVec& cell) { kept[layout.offset(cell)] = valid[layout.offset(cell)]; });
+      amr::for_each_cell({}, filled(n), [&](const IntVec& cell) {
+        kept[layout.offset(cell)] = valid[layout.offset(cell)];
+      });
     });
   }
 }
@@ -335,7 +355,10 @@ double Orientation::sweep(double dt, bool first) {
   ghosts_->fill({psi_, grain_, alpha_});
   std::vector<double> most(at(mesh_->size()), 0.0);
   amr::parallel_for(mesh_->size(), [&](int b) { most[at(b)] = set_system(b, dt, first); });
-  const double force = amr::global_max(most.empty() ? 0.0 : *std::max_element(most.begin(), most.end()), mesh_->comm());
+  const auto largest = [&] {
+    return amr::global_max(most.empty() ? 0.0 : *std::max_element(most.begin(), most.end()), mesh_->comm());
+  };
+  const double force = largest();
   constexpr double NOTHING = 1e-13;  // rad
   if (force * dt / TAU_ALPHA < NOTHING) return 0;
   if (options_.p == Mobility::constant) {
@@ -346,21 +369,23 @@ double Orientation::sweep(double dt, bool first) {
   const amr::ScalarResult result = solver_->solve();
   iterations_ += result.iterations;
   if (!result.converged)
-    throw NumericalError(fmt::format("eq. (4) is not solved after {} iterations: residual {:.3g}, tolerance {:.3g}; a smaller "
-                                     "orientation.max_dt_tau0 may help", result.iterations, result.residual, options_.tolerance));
+    throw NumericalError(fmt::format("eq. (4) is not solved after {} iterations: residual {:.3g}, tolerance {:.3g}; a "
+                                     "smaller orientation.max_dt_tau0 may help",
+                                     result.iterations, result.residual, options_.tolerance));
   amr::parallel_for(mesh_->size(), [&](int b) {
     const auto [g, i] = solver_->hierarchy().place_of_block(b);
-    const double *change = solver_->solution().at(g, i, 0), *psi = mesh_->cells(psi_, b), *grain = mesh_->cells(grain_, b);
-    double *alpha = mesh_->cells(alpha_, b), largest = 0;
+    const double *change = solver_->solution().at(g, i, 0), *psi = mesh_->cells(psi_, b);
+    const double* grain = mesh_->cells(grain_, b);
+    double *alpha = mesh_->cells(alpha_, b), largest_here = 0;
     amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
       const std::ptrdiff_t q = layout.offset(cell);
       if (psi[q] <= LIQUID || !free_cell(grain[q])) return;
       alpha[q] += change[q];
-      largest = std::max(largest, std::abs(change[q]));
+      largest_here = std::max(largest_here, std::abs(change[q]));
     });
-    most[at(b)] = largest;
+    most[at(b)] = largest_here;
   });
-  return amr::global_max(most.empty() ? 0.0 : *std::max_element(most.begin(), most.end()), mesh_->comm());
+  return largest();
 }
 
 // P tau_alpha (alpha_new - alpha_old)/dt = div[(g s/|grad alpha| + h e^2) grad alpha_new] of block b for the unknown
@@ -396,7 +421,8 @@ double Orientation::set_system(int b, double dt, bool first) {
         if (c == a) continue;
         const std::ptrdiff_t t = layout.stride(c);
         const double along = (difference(alpha[q], alpha[q - t]) + difference(alpha[q + t], alpha[q]) +
-                              difference(alpha[q - s], alpha[q - s - t]) + difference(alpha[q - s + t], alpha[q - s])) / (4 * dx);
+                              difference(alpha[q - s], alpha[q - s - t]) + difference(alpha[q - s + t], alpha[q - s])) /
+                             (4 * dx);
         square += along * along;
       }
       const double f = 0.5 * (1 + phi_of_psi(0.5 * (psi[q] + psi[q - s])));
@@ -441,7 +467,8 @@ void Orientation::tag(int b, amr::Tag& tag) const {
     const std::ptrdiff_t s = layout.stride(a);
     amr::for_each_cell(filled(-1), filled(layout.n + 1), [&](const IntVec& cell) {
       const std::ptrdiff_t q = layout.offset(cell);
-      if (psi[q] > LIQUID && psi[q + s] > LIQUID && std::abs(difference(alpha[q + s], alpha[q])) > JUMP) found = true;
+      const bool solid = psi[q] > LIQUID && psi[q + s] > LIQUID;
+      if (solid && std::abs(difference(alpha[q + s], alpha[q])) > JUMP) found = true;
     });
   }
   if (found) tag.level = tag.keep = mesh_->shape().max_level;

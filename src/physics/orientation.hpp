@@ -20,6 +20,7 @@ struct OrientationOptions {
   Mobility p = Mobility::constant;
   double max_dt_tau0 = 1;
   double tolerance = 1e-3;
+  bool everywhere = false;
 
   void declare(io::Schema& schema);
 };
@@ -27,12 +28,12 @@ struct OrientationOptions {
 /// P for a given w = e |grad alpha|.
 double inverse_mobility(Mobility law, double w);
 
-/// Provides the cell field "alpha" (2D): the exact angle of its grain in every cell of a grain that nothing touches, and
-/// the solution of eq. (4) in grains that touch others. In 3D there is no equation: a cell has the axes of its grain.
-/// Reads psi, "grain" and, if there is one, the velocity.
+/// Provides the cell field "alpha" (2D): the exact angle of its grain in every cell of a grain that nothing touches,
+/// and the solution of eq. (4) in grains that touch others. In 3D there is no equation: a cell has the axes of its
+/// grain. Provides "grain" as well, as long as nobody else does. Reads psi and, if there is one, the velocity.
 ///
-/// Eq. (4) is split: alpha is carried, turned by half the vorticity of the solid, and then relaxes by backward Euler with
-/// coefficients from before, on all levels at once. All differences are taken modulo a right angle.
+/// Eq. (4) is split: alpha is carried, turned by half the vorticity of the solid, and then relaxes by backward Euler
+/// with coefficients from before, on all levels at once. All differences are taken modulo a right angle.
 class Orientation : public Module {
  public:
   Orientation(const OrientationOptions& options, std::vector<Seed>& crystals);
@@ -55,12 +56,14 @@ class Orientation : public Module {
   void carry(double dt);
   void carry_stage(amr::CellField from, amr::CellField to, double old_share, double dt);
   void turn(double dt);
-  void extend(amr::CellField values, double least_psi, int layers, bool touching_only);
+  void extend(amr::CellField values, double least_psi, int layers, bool free_only);
   void relax(double dt);
   double sweep(double dt, bool first);
   double set_system(int b, double dt, bool first);
   double fastest_crossing() const;
-  bool free_cell(double grain) const { return crystals_[static_cast<std::size_t>(grain)].touching; }
+  /// Whether eq. (4) holds in a crystal.
+  bool free(const Seed& crystal) const { return options_.everywhere || crystal.touching; }
+  bool free_cell(double grain) const { return free(crystals_[static_cast<std::size_t>(grain)]); }
 
   OrientationOptions options_;
   std::vector<Seed>& crystals_;

@@ -16,8 +16,8 @@ using physics::RIGHT_ANGLE;
 constexpr double DEGREE = M_PI / 180;
 
 std::string crystal(double x, double y, double radius, double angle_deg) {
-  return "[[seed]]\nposition_W0 = [" + std::to_string(x) + ", " + std::to_string(y) + "]\nradius_W0 = " + std::to_string(radius) +
-         "\nangle_deg = " + std::to_string(angle_deg) + "\n";
+  return "[[seed]]\nposition_W0 = [" + std::to_string(x) + ", " + std::to_string(y) +
+         "]\nradius_W0 = " + std::to_string(radius) + "\nangle_deg = " + std::to_string(angle_deg) + "\n";
 }
 
 // An alloy that hardly couples phase and solute: eqs. (1) and (4) alone. No anisotropy.
@@ -26,7 +26,8 @@ const std::string PURE =
 
 std::string box(double x, double y, int roots_x, int roots_y, const std::string& more = "") {
   return "[run]\nend_time_tau0 = 1e6\n[mesh]\ndim = 2\nsize_W0 = [" + std::to_string(x) + ", " + std::to_string(y) +
-         "]\nblock_cells = 8\nlevels = 1\nroot_blocks = [" + std::to_string(roots_x) + ", " + std::to_string(roots_y) + "]\n" + more;
+         "]\nblock_cells = 8\nlevels = 1\nroot_blocks = [" + std::to_string(roots_x) + ", " + std::to_string(roots_y) +
+         "]\n" + more;
 }
 
 // f(psi, alpha, neighbours' differences) over all interior cells, ghosts filled.
@@ -48,9 +49,10 @@ void each_cell(Scene& s, const std::function<void(int, const Cell&)>& f) {
   }
 }
 
-// All solid; two grains, which touch, where grain(x) says.
+const std::string EVERYWHERE = "[orientation]\neverywhere = true\n";
+
+// All solid; two grains where grain(x) says.
 void fill_with_solid(Scene& s, const std::function<int(const RealVec&)>& grain) {
-  for (physics::Seed& c : s->crystals()) c.touching = true;
   each_cell(s, [&](int b, const Cell& c) {
     const int g = grain(c.x);
     s->mesh().cells(s->field("psi"), b)[c.q] = physics::PSI_MAX;
@@ -82,7 +84,9 @@ Boundary measure(Scene& s, double width) {
       const double dphi = (physics::phi_of_psi(p[t]) - phi) / dx;
       const double dalpha = std::abs(amr::wrapped(a[t] - a[0], RIGHT_ANGLE)) / dx;
       const double f = 0.5 * (1 + physics::phi_of_psi(0.5 * (p[t] + p[0])));
-      energy += 0.5 * dphi * dphi + f * f * (physics::Disorder::s * dalpha + 0.5 * physics::Disorder::e * physics::Disorder::e * dalpha * dalpha);
+      using physics::Disorder;
+      const double disorder = Disorder::s * dalpha + 0.5 * Disorder::e * Disorder::e * dalpha * dalpha;
+      energy += 0.5 * dphi * dphi + f * f * disorder;
       m.turn += dalpha * area;
     }
     m.energy += energy * area;
@@ -92,8 +96,8 @@ Boundary measure(Scene& s, double width) {
 
 struct Slab : Scene {
   Slab(double degrees, double dx, const std::string& orientation)
-      : Scene(box(64 * dx, 8 * dx, 8, 1, PURE + "[orientation]\n" + orientation + "\n" + crystal(16 * dx, 4 * dx, 4, 0) +
-                                             crystal(48 * dx, 4 * dx, 4, degrees))) {
+      : Scene(box(64 * dx, 8 * dx, 8, 1, PURE + EVERYWHERE + orientation + "\n") +
+              crystal(16 * dx, 4 * dx, 4, 0) + crystal(48 * dx, 4 * dx, 4, degrees)) {
     fill_with_solid(*this, [&](const RealVec& x) { return x[0] < 32 * dx ? 0 : 1; });
   }
 };
@@ -109,7 +113,8 @@ TEST(Orientation, EnergyOfABoundary) {
     Slab s(known.degrees, dx, "P = \"warren\"");
     each_cell(s, [&](int b, const Cell& c) {
       constexpr double WIDTH = 2.3;
-      s->mesh().cells(s->field("alpha"), b)[c.q] = known.degrees * DEGREE * 0.5 * (1 + std::tanh(2 * (c.x[0] - middle) / WIDTH));
+      const double share = 0.5 * (1 + std::tanh(2 * (c.x[0] - middle) / WIDTH));
+      s->mesh().cells(s->field("alpha"), b)[c.q] = known.degrees * DEGREE * share;
     });
     s.advance_to(10);
     const Boundary m = measure(s, 8 * dx);
@@ -128,7 +133,9 @@ double embedded_area(Scene& s) {
   double area = 0;
   each_cell(s, [&](int b, const Cell& c) {
     const double alpha = s->mesh().cells(s->field("alpha"), b)[c.q];
-    const auto away = [&](std::size_t g) { return std::abs(amr::wrapped(alpha - s->crystals()[g].angle, RIGHT_ANGLE)); };
+    const auto away = [&](std::size_t g) {
+      return std::abs(amr::wrapped(alpha - s->crystals()[g].angle, RIGHT_ANGLE));
+    };
     if (away(1) < away(0)) area += c.block->dx * c.block->dx;
   });
   return area;
@@ -138,9 +145,13 @@ TEST(Orientation, EmbeddedGrain) {
   if (DIM == 3) return;
   const double side = 96 * 0.8, radius = 20;
   // With Warren's P shorter steps than usual, which coefficients from before would slow down.
-  for (const auto& [law, end] : {std::pair{"P = \"constant\"", 400.}, std::pair{"P = \"warren\"\nmax_dt_tau0 = 0.25", 6.}}) {
-    Scene s(box(side, side, 12, 12, PURE + "[orientation]\n" + law + "\n" + crystal(4, 4, 3, 0) + crystal(side / 2, side / 2, 5, 30)));
-    fill_with_solid(s, [&](const RealVec& x) { return std::hypot(x[0] - side / 2, x[1] - side / 2) < radius ? 1 : 0; });
+  const std::string constant = "P = \"constant\"", warren = "P = \"warren\"\nmax_dt_tau0 = 0.25";
+  for (const auto& [law, end] : {std::pair{constant, 400.}, std::pair{warren, 6.}}) {
+    const std::string grains = crystal(4, 4, 3, 0) + crystal(side / 2, side / 2, 5, 30);
+    Scene s(box(side, side, 12, 12, PURE + EVERYWHERE + law + "\n" + grains));
+    fill_with_solid(s, [&](const RealVec& x) {
+      return std::hypot(x[0] - side / 2, x[1] - side / 2) < radius ? 1 : 0;
+    });
     const double before = std::sqrt(embedded_area(s) / M_PI);
     s.advance_to(end);
     const double after = std::sqrt(embedded_area(s) / M_PI);
@@ -193,9 +204,8 @@ TEST(Orientation, CrystalsMeet) {
 // Where the melt holds another angle, solid that grows into it carries on its own.
 TEST(Orientation, GrowthKeepsTheAngle) {
   if (DIM == 3) return;
-  Scene s(box(64, 64, 8, 8, "[alloy]\nsupersaturation = 0.6\n[orientation]\n" + crystal(32, 32, 8, 17)));
+  Scene s(box(64, 64, 8, 8, "[alloy]\nsupersaturation = 0.6\n" + EVERYWHERE + crystal(32, 32, 8, 17)));
   const double own = s->crystals()[0].angle;
-  s->crystals()[0].touching = true;
   s->crystals()[0].angle += 0.4;  // what the melt is given
   const double before = s->totals().solid_fraction;
   s.advance_to(30);
@@ -212,10 +222,10 @@ TEST(Orientation, GrowthKeepsTheAngle) {
 
 TEST(Orientation, RigidTurn) {
   if (DIM == 3) return;
-  for (const bool touching : {false, true}) {
-    Scene s(box(64, 64, 8, 8, "[phase_field]\nfrozen = true\n[flow]\nvelocity_gradient_per_tau0 = [0, -0.02, 0.02, 0]\n[orientation]\n" +
-                                  crystal(32, 32, 12, 10)));
-    s->crystals()[0].touching = touching;
+  for (const bool everywhere : {false, true}) {
+    const std::string turn = "[flow]\nvelocity_gradient_per_tau0 = [0, -0.02, 0.02, 0]\n" +
+                             (everywhere ? EVERYWHERE : std::string("[orientation]\n"));
+    Scene s(box(64, 64, 8, 8, "[phase_field]\nfrozen = true\n" + turn + crystal(32, 32, 12, 10)));
     s.advance_to(30 * DEGREE / 0.02);
     double most = 0;
     int other = 0;
@@ -225,8 +235,8 @@ TEST(Orientation, RigidTurn) {
       most = std::max(most, std::abs(alpha - 40 * DEGREE));
       if (alpha != s->crystals()[0].angle) ++other;
     });
-    EXPECT_LT(most, 1e-10) << touching;
-    EXPECT_TRUE(touching || other == 0) << other << " cells that do not have the very angle of their crystal";
+    EXPECT_LT(most, 1e-10) << everywhere;
+    EXPECT_TRUE(everywhere || other == 0) << other << " cells that do not have the very angle of their crystal";
   }
 }
 
@@ -234,9 +244,8 @@ TEST(Orientation, RigidTurn) {
 TEST(Orientation, SpinningDisc) {
   if (DIM == 3) return;
   constexpr double RATE = 0.02, RADIUS = 14;
-  Scene s(box(51.2, 51.2, 8, 8, "[phase_field]\nfrozen = true\n[flow]\nvelocity_W0_tau0 = [0, 0]\n[orientation]\n" +
+  Scene s(box(51.2, 51.2, 8, 8, "[phase_field]\nfrozen = true\n[flow]\nvelocity_W0_tau0 = [0, 0]\n" + EVERYWHERE +
                                     crystal(25.6, 25.6, RADIUS, 0)));
-  s->crystals()[0].touching = true;
   amr::Mesh& mesh = s->mesh();
   for (int b = 0; b < mesh.size(); ++b)
     for (int axis = 0; axis < DIM; ++axis) {
@@ -259,14 +268,15 @@ TEST(Orientation, SpinningDisc) {
   EXPECT_LT(most, 0.005 * turn);
 }
 
-// Two crystals far from each other grow as each does alone, but for other time steps: every cell has the axes of its own.
+// Two crystals far from each other grow as each does alone, but for other time steps: cells have the axes of their own.
 TEST(Orientation, EachCrystalHasItsOwnAxes) {
   const std::string one = DIM == 2 ? "position_W0 = [24, 24]\nradius_W0 = 10\nangle_deg = 10\n"
                                    : "position_W0 = [24, 24, 24]\nradius_W0 = 10\neuler_deg = [10, 20, 0]\n";
   const std::string two = DIM == 2 ? "position_W0 = [72, 24]\nradius_W0 = 10\nangle_deg = 45\n"
                                    : "position_W0 = [72, 24, 24]\nradius_W0 = 10\neuler_deg = [45, 0, 0]\n";
   const std::string start = std::string("[run]\nend_time_tau0 = 100\n[mesh]\ndim = ") + (DIM == 2 ? "2" : "3") +
-                            "\nsize_W0 = " + (DIM == 2 ? "[96, 48]" : "[96, 48, 48]") + "\ndx_W0 = 1.5\nblock_cells = 8\n";
+                            "\nsize_W0 = " + (DIM == 2 ? "[96, 48]" : "[96, 48, 48]") +
+                            "\ndx_W0 = 1.5\nblock_cells = 8\n";
   Scene pair(start + "[[seed]]\n" + one + "[[seed]]\n" + two);
   Scene first(start + "[[seed]]\n" + one), second(start + "[[seed]]\n" + two);
   for (Scene* s : {&pair, &first, &second}) s->advance_to(DIM == 2 ? 6 : 3);
@@ -275,7 +285,8 @@ TEST(Orientation, EachCrystalHasItsOwnAxes) {
   const std::vector<physics::Tip> other = second->tips(), together = pair->tips();
   alone.insert(alone.end(), other.begin(), other.end());
   ASSERT_EQ(together.size(), alone.size());
-  for (std::size_t i = 0; i < alone.size(); ++i) EXPECT_NEAR(together[i].length, alone[i].length, 3e-4 * alone[i].length) << i;
+  for (std::size_t i = 0; i < alone.size(); ++i)
+    EXPECT_NEAR(together[i].length, alone[i].length, 3e-4 * alone[i].length) << i;
   EXPECT_LT(std::abs(pair->solute_drift(pair->totals())), 1e-13);
   // The wrong axes would show.
   Scene wrong(start + "[phase_field]\nanisotropy = 0\n[[seed]]\n" + one);
