@@ -290,7 +290,8 @@ ScalarResult ScalarSolver::solve() {
       result.iterations += solve_by_hypre(x, r);
     } else {
       GcrOptions o;
-      // A little less, for the round-off of carrying it; and less again where it was small in the Krylov method's norm only.
+      // A little less, for the round-off of carrying it; later much less, where its norm, weighted with the diagonal, has
+      // been content too early.
       o.tolerance = 0.95 * std::pow(0.3, pass) * options_.tolerance;
       o.max_iterations = options_.max_iterations - result.iterations;
       o.directions = options_.directions;

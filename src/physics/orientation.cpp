@@ -108,16 +108,7 @@ void Orientation::attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) {
 
 void Orientation::initialize() {
   label_nearest_seed();
-  if constexpr (DIM == 3) return;
-  // In all cells, the solid included.
-  const amr::Layout& layout = mesh_->layout();
-  amr::parallel_for(mesh_->size(), [&](int b) {
-    const double* grain = mesh_->cells(grain_, b);
-    double* alpha = mesh_->cells(alpha_, b);
-    amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
-      alpha[layout.offset(cell)] = crystals_[static_cast<std::size_t>(grain[layout.offset(cell)])].angle;
-    });
-  });
+  if constexpr (DIM == 2) impose(crystals_, true);
 }
 
 // Stands in for a module that labels grains as they move and grow.
@@ -166,8 +157,8 @@ void Orientation::find_contacts() {
   for (std::size_t g = 0; g < crystals_.size(); ++g) crystals_[g].touching = crystals_[g].touching || touching[g] > 0;
 }
 
-// The angle of its grain wherever eq. (4) has nothing to say.
-void Orientation::impose(const std::vector<Seed>& crystals) {
+// The angle of its grain wherever eq. (4) has nothing to say, or in all cells.
+void Orientation::impose(const std::vector<Seed>& crystals, bool all) {
   const amr::Layout& layout = mesh_->layout();
   amr::parallel_for(mesh_->size(), [&](int b) {
     const double *psi = mesh_->cells(psi_, b), *grain = mesh_->cells(grain_, b);
@@ -175,7 +166,7 @@ void Orientation::impose(const std::vector<Seed>& crystals) {
     amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
       const std::ptrdiff_t q = layout.offset(cell);
       const Seed& crystal = crystals[static_cast<std::size_t>(grain[q])];
-      if (!free(crystal) || psi[q] <= LIQUID) alpha[q] = crystal.angle;
+      if (all || !free(crystal) || psi[q] <= LIQUID) alpha[q] = crystal.angle;
     });
   });
 }
@@ -187,7 +178,7 @@ void Orientation::advance(double, double dt, std::int64_t) {
   for (Seed& s : moved) s.advance(dt);
   if (std::none_of(moved.begin(), moved.end(), [&](const Seed& s) { return free(s); })) {
     elapsed_ = 0;
-    impose(moved);
+    impose(moved, true);
     return;
   }
   const double crossing = fastest_crossing();
@@ -196,7 +187,7 @@ void Orientation::advance(double, double dt, std::int64_t) {
     for (int i = 0; i < steps; ++i) carry(dt / steps);
     turn(dt);
   }
-  impose(moved);
+  impose(moved, false);
   elapsed_ += dt;
   if (elapsed_ + 0.5 * dt >= options_.max_dt_tau0) {
     relax(elapsed_);

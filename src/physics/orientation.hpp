@@ -52,7 +52,7 @@ class Orientation : public Module {
  private:
   void label_nearest_seed();
   void find_contacts();
-  void impose(const std::vector<Seed>& crystals);
+  void impose(const std::vector<Seed>& crystals, bool all);
   void carry(double dt);
   void carry_stage(amr::CellField from, amr::CellField to, double old_share, double dt);
   void turn(double dt);
