@@ -519,6 +519,15 @@ void Simulation::write_plotfile() {
       {"alpha", of_state([angle](int, double, double) { return angle; })},
   };
   if (own_alpha) fields.back().values = of_field(*own_alpha);
+  if (own_grain && !own_alpha)
+    fields.back().values = [this, &layout, own_grain](int b, std::span<double> out) {
+      const double* grain = mesh_->cells({*own_grain}, b);
+      std::size_t i = 0;
+      amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
+        const RealVec& axis = crystals_[at(static_cast<int>(grain[layout.offset(cell)]))].axes[0];
+        out[i++] = std::atan2(axis[1], axis[0]);
+      });
+    };
   const auto zero = of_state([](int, double, double) { return 0.0; });
   const auto velocity = mesh_->fields().find("velocity_x"), pressure = mesh_->fields().find("pressure");
   for (int a = 0; a < DIM; ++a) {

@@ -112,8 +112,8 @@ inline void prolong_box(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<con
 inline double wrapped(double x, double period) { return x - period * std::nearbyint(x / period); }
 
 /// restrict_box and prolong_box for angles modulo `period`: 85 and 5 degrees are 10 degrees apart.
-inline void restrict_angles(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<const double> src, const IntVec& src_lo,
-                            const IntVec& size, double period) {
+inline void restrict_angles(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<const double> src,
+                            const IntVec& src_lo, const IntVec& size, double period) {
   for_each_cell({}, size, [&](const IntVec& cell) {
     IntVec to = dst_lo, from = src_lo;
     for (int a = 0; a < DIM; ++a) {
@@ -148,8 +148,8 @@ inline void prolong_angles(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<
 }
 
 /// The same for labels.
-inline void restrict_labels(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<const double> src, const IntVec& src_lo,
-                            const IntVec& size) {
+inline void restrict_labels(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<const double> src,
+                            const IntVec& src_lo, const IntVec& size) {
   for_each_cell({}, size, [&](const IntVec& cell) {
     IntVec to = dst_lo, from = src_lo;
     for (int a = 0; a < DIM; ++a) {
@@ -169,8 +169,8 @@ inline void prolong_labels(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<
 }
 
 /// As the row of a field in cells asks for.
-inline void restrict_cells(const FieldSpec& field, ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<const double> src,
-                           const IntVec& src_lo, const IntVec& size) {
+inline void restrict_cells(const FieldSpec& field, ArrayRef<double> dst, const IntVec& dst_lo,
+                           ArrayRef<const double> src, const IntVec& src_lo, const IntVec& size) {
   switch (field.mixing) {
     case Mixing::means: return restrict_box(dst, dst_lo, src, src_lo, size);
     case Mixing::angles: return restrict_angles(dst, dst_lo, src, src_lo, size, field.period);
@@ -178,8 +178,8 @@ inline void restrict_cells(const FieldSpec& field, ArrayRef<double> dst, const I
   }
 }
 
-inline void prolong_cells(const FieldSpec& field, ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<const double> src,
-                          const IntVec& size) {
+inline void prolong_cells(const FieldSpec& field, ArrayRef<double> dst, const IntVec& dst_lo,
+                          ArrayRef<const double> src, const IntVec& size) {
   switch (field.mixing) {
     case Mixing::means: return prolong_box(dst, dst_lo, src, size);
     case Mixing::angles: return prolong_angles(dst, dst_lo, src, size, field.period);

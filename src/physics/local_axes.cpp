@@ -17,10 +17,8 @@ bool uniform(const double* values, const amr::Layout& layout) {
   return std::all_of(p, p + layout.size(), [&](double x) { return x == *p; });
 }
 
-// Row i: crystal axis i. In 2D the angle decides; a crystal whose angle it is gives its axes, which may be exact.
-Array<RealVec> axes_of(double angle, const Seed& crystal) {
-  if constexpr (DIM == 3) return crystal.axes;
-  if (angle == crystal.angle) return crystal.axes;
+// Row i: crystal axis i, for a given turn in the plane.
+Array<RealVec> axes_of(double angle) {
   Array<RealVec> axes{};
   axes[0][0] = axes[1][1] = std::cos(angle);
   axes[0][1] = std::sin(angle);
@@ -39,9 +37,7 @@ void LocalAxes::attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) {
 
 void LocalAxes::update(const std::vector<Seed>& crystals) {
   if (!active()) return;
-  std::vector<amr::CellField> fields{grain_};
-  if (alpha_.id >= 0) fields.push_back(alpha_);
-  ghosts_->fill(fields);
+  ghosts_->fill({alpha_.id >= 0 ? alpha_ : grain_});
   blocks_.resize(at(mesh_->size()));
   amr::parallel_for(mesh_->size(), [&](int b) { prepare(b, crystals, blocks_[at(b)]); });
 }
@@ -52,8 +48,10 @@ void LocalAxes::prepare(int b, const std::vector<Seed>& crystals, Own& own) cons
   const double* alpha = alpha_.id >= 0 ? mesh_->cells(alpha_, b) : nullptr;
   const auto crystal = [&](std::ptrdiff_t q) -> const Seed& { return crystals[static_cast<std::size_t>(grain[q])]; };
   own.arrays.clear();
+  own.disordered = false;
   if (uniform(alpha != nullptr ? alpha : grain, layout)) {
-    own.axes = axes_of(alpha != nullptr ? *alpha : 0.0, crystal(0));
+    // A crystal whose angle it is gives its axes, which may be those of the mesh exactly.
+    own.axes = alpha == nullptr || *alpha == crystal(0).angle ? crystal(0).axes : axes_of(*alpha);
     own.rotated = false;
     for (int i = 0; i < DIM; ++i)
       for (int a = 0; a < DIM; ++a) own.rotated = own.rotated || own.axes[i][a] != (i == a ? 1.0 : 0.0);
@@ -63,38 +61,60 @@ void LocalAxes::prepare(int b, const std::vector<Seed>& crystals, Own& own) cons
   double* first = own.arrays.data() + layout.interior();
   amr::for_each_cell(filled(-1), filled(layout.n + 2), [&](const IntVec& cell) {
     const std::ptrdiff_t q = layout.offset(cell);
-    const Array<RealVec> axes = axes_of(alpha != nullptr ? alpha[q] : 0.0, crystal(q));
+    const Array<RealVec> axes = alpha == nullptr ? crystal(q).axes : axes_of(alpha[q]);
     for (int i = 0; i < DIM; ++i)
       for (int a = 0; a < DIM; ++a) first[(i * DIM + a) * layout.size() + q] = axes[i][a];
   });
-  if (alpha != nullptr) set_disorder(alpha, mesh_->block(b).dx, first + DIM * DIM * layout.size());
+  if (alpha == nullptr) return;
+  double* disorder = first + DIM * DIM * layout.size();
+  set_disorder(alpha, mesh_->block(b).dx, disorder);
+  amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
+    own.disordered = own.disordered || disorder[layout.offset(cell)] > 0;
+  });
 }
 
-// Mean over the faces of a cell of s |grad alpha| + e^2/2 |grad alpha|^2: the disorder at the faces is what the equation
-// of alpha lets relax.
+// Mean of s |grad alpha| + e^2/2 |grad alpha|^2 over the faces of a cell: the disorder at the faces is what the equation
+// of alpha lets relax. Loops cover contiguous memory, from the first to the last place needed.
 void LocalAxes::set_disorder(const double* alpha, double dx, double* disorder) const {
   const amr::Layout& layout = mesh_->layout();
-  const auto difference = [&](std::ptrdiff_t q, std::ptrdiff_t s) { return amr::wrapped(alpha[q + s] - alpha[q], RIGHT_ANGLE); };
-  const auto at_face = [&](std::ptrdiff_t q, int axis) {  // the high one of q
-    const std::ptrdiff_t s = layout.stride(axis);
-    const double normal = difference(q, s) / dx;
-    double square = normal * normal;
-    for (int a = 0; a < DIM; ++a) {
-      if (a == axis) continue;
-      const std::ptrdiff_t t = layout.stride(a);
-      const double along = (difference(q - t, t) + difference(q, t) + difference(q + s - t, t) + difference(q + s, t)) / (4 * dx);
-      square += along * along;
+  const auto size = static_cast<std::size_t>(layout.size());
+  thread_local std::vector<double> scratch;
+  scratch.resize((DIM + 1) * size);
+  Array<double*> step{};  // from a cell to the next one along an axis
+  for (int a = 0; a < DIM; ++a) step[a] = scratch.data() + at(a) * size + layout.interior();
+  double* face = scratch.data() + DIM * size + layout.interior();  // the high one of a cell
+  const double over = 1 / dx;
+  for (int a = 0; a < DIM; ++a) {
+    const std::ptrdiff_t s = layout.stride(a), first = -layout.interior(), last = layout.size() - layout.interior() - s;
+    double* to = step[a];
+#pragma omp simd
+    for (std::ptrdiff_t q = first; q < last; ++q) to[q] = over * amr::wrapped(alpha[q + s] - alpha[q], RIGHT_ANGLE);
+  }
+  for (int a = 0; a < DIM; ++a) {
+    const std::ptrdiff_t s = layout.stride(a);
+    IntVec lo = filled(-1);
+    lo[a] = -2;
+    const std::ptrdiff_t first = layout.offset(lo), last = layout.offset(filled(layout.n));
+    for (std::ptrdiff_t q = first; q <= last; ++q) face[q] = step[a][q] * step[a][q];
+    for (int c = 0; c < DIM; ++c) {
+      if (c == a) continue;
+      const std::ptrdiff_t t = layout.stride(c);
+      const double* along = step[c];
+#pragma omp simd
+      for (std::ptrdiff_t q = first; q <= last; ++q) {
+        const double mean = 0.25 * ((along[q - t] + along[q]) + (along[q + s - t] + along[q + s]));
+        face[q] += mean * mean;
+      }
     }
-    constexpr double gamma = Disorder::gamma;
-    return Disorder::s * (std::sqrt(square + gamma * gamma) - gamma) + 0.5 * Disorder::e * Disorder::e * square;
-  };
-  amr::for_each_cell(filled(-1), filled(layout.n + 2), [&](const IntVec& cell) {
-    const std::ptrdiff_t q = layout.offset(cell);
-    double sum = 0;
-    for (int a = 0; a < DIM; ++a) sum += at_face(q - layout.stride(a), a) + at_face(q, a);
-    constexpr double NEGLIGIBLE = 1e-5;  // lowers phi by half of that
-    disorder[q] = sum / FACES > NEGLIGIBLE ? sum / FACES : 0.0;
-  });
+    constexpr double gamma = Disorder::gamma, square = 0.5 * Disorder::e * Disorder::e;
+#pragma omp simd
+    for (std::ptrdiff_t q = first; q <= last; ++q)
+      face[q] = Disorder::s * (std::sqrt(face[q] + gamma * gamma) - gamma) + square * face[q];
+    for (std::ptrdiff_t q = layout.offset(filled(-1)); q <= last; ++q) disorder[q] += (face[q - s] + face[q]) / FACES;
+  }
+  constexpr double NEGLIGIBLE = 1e-5;  // lowers phi by half of that
+  for (std::ptrdiff_t q = layout.offset(filled(-1)); q <= layout.offset(filled(layout.n)); ++q)
+    if (disorder[q] < NEGLIGIBLE) disorder[q] = 0;
 }
 
 void LocalAxes::apply(int b, AlloyBlock& block, AlloyParameters& parameters) const {

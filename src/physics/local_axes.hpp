@@ -28,16 +28,17 @@ class LocalAxes {
  public:
   void attach(amr::Mesh& mesh, amr::GhostExchange& ghosts);
   bool active() const { return grain_.id >= 0; }
-  /// Collective; fills the ghosts of both fields.
+  /// Collective; fills the ghosts of the field that decides.
   void update(const std::vector<Seed>& crystals);
-  bool mixed(int b) const { return active() && !blocks_[static_cast<std::size_t>(b)].arrays.empty(); }
+  /// Whether a boundary of grains may form in block b, even if it is all solid.
+  bool disordered(int b) const { return active() && blocks_[static_cast<std::size_t>(b)].disordered; }
   /// Hands the kernel what block b has of its own.
   void apply(int b, AlloyBlock& block, AlloyParameters& parameters) const;
 
  private:
   struct Own {
     Array<RealVec> axes{};
-    bool rotated = false;
+    bool rotated = false, disordered = false;
     std::vector<double> arrays;  // axes cell by cell, then the disorder; empty: axes are the same everywhere
   };
   void prepare(int b, const std::vector<Seed>& crystals, Own& own) const;

@@ -34,15 +34,23 @@ double limited_part(double behind, double ahead) {
 }  // namespace
 
 void OrientationOptions::declare(io::Schema& schema) {
-  io::Table& t = schema.table("orientation", "angles of crystals that touch, eq. (4); on by itself where crystals have several orientations");
+  io::Table& t = schema.table("orientation", "angles of crystals that touch, eq. (4); on by itself where crystals have "
+                                             "several orientations");
   t.choice("P", p, {{"constant", Mobility::constant}, {"warren", Mobility::warren}, {"printed", Mobility::printed}})
-      .doc("inverse mobility of the angle: mu/e everywhere; 1-(1-mu/e) exp(-beta w), with which boundaries sweep whole grains");
-  t.real("max_dt_tau0", max_dt_tau0).unit("tau0").above(0).at_most(10).doc("longest time between two solutions of eq. (4)");
+      .doc("inverse mobility of the angle: mu/e everywhere; 1-(1-mu/e) exp(-beta w), with which boundaries sweep whole "
+           "grains");
+  t.real("max_dt_tau0", max_dt_tau0)
+      .unit("tau0")
+      .above(0)
+      .at_most(10)
+      .doc("time between two solutions of eq. (4); with warren .1 to .25 are advisable");
   t.real("tolerance", tolerance).range(1e-12, 0.1).doc("residual of a solution over the change it is to bring");
+  t.boolean("everywhere", everywhere).doc("eq. (4) in all crystals; otherwise one that touches no other has one exact angle");
   schema.check({"orientation"}, [this](io::Checks& checks) {
     if (p == Mobility::printed)
       checks.fail("orientation.P", "constant or warren: the printed P = 1-(1+mu/e) exp(-beta w) is negative where the "
-                                   "orientation is uniform, so that disturbances grow the faster the shorter they are", "printed");
+                                   "orientation is uniform, so that disturbances grow the faster the shorter they are",
+                  "printed");
   });
 }
 
@@ -55,7 +63,8 @@ double inverse_mobility(Mobility law, double w) {
   return MU_OVER_E;
 }
 
-Orientation::Orientation(const OrientationOptions& options, std::vector<Seed>& crystals) : options_(options), crystals_(crystals) {}
+Orientation::Orientation(const OrientationOptions& options, std::vector<Seed>& crystals)
+    : options_(options), crystals_(crystals) {}
 
 void Orientation::declare(amr::FieldTable& fields) {
   if constexpr (DIM == 3) return;
@@ -92,11 +101,54 @@ void Orientation::attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) {
 }
 
 void Orientation::initialize() {
-  if constexpr (DIM == 2) impose(crystals_);
+  if constexpr (DIM == 2) impose(crystals_, true);
+  present_ = static_cast<int>(std::ranges::count_if(crystals_, &Seed::present));
 }
 
-// The angle of its grain wherever eq. (4) has nothing to say.
-void Orientation::impose(const std::vector<Seed>& crystals) {
+// A crystal that has just appeared has its own angle, not that of the melt that was there.
+void Orientation::welcome() {
+  const int present = static_cast<int>(std::ranges::count_if(crystals_, &Seed::present));
+  if (present == present_) return;
+  present_ = present;
+  const amr::Layout& layout = mesh_->layout();
+  amr::parallel_for(mesh_->size(), [&](int b) {
+    const double* grain = mesh_->cells(grain_, b);
+    double* alpha = mesh_->cells(alpha_, b);
+    amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
+      const std::ptrdiff_t q = layout.offset(cell);
+      const Seed& crystal = crystals_[static_cast<std::size_t>(grain[q])];
+      if (!crystal.touching) alpha[q] = crystal.angle;
+    });
+  });
+}
+
+// What the field has turned beyond the rigid motion counts as the crystal's turn.
+void Orientation::follow(const std::vector<Seed>& moved) {
+  const amr::Layout& layout = mesh_->layout();
+  std::vector<std::vector<std::array<double, 2>>> parts(at(mesh_->size()));  // volume; times what the angle is beyond
+  amr::parallel_for(mesh_->size(), [&](int b) {
+    const double *psi = mesh_->cells(psi_, b), *grain = mesh_->cells(grain_, b), *alpha = mesh_->cells(alpha_, b);
+    const double cell_volume = std::pow(mesh_->block(b).dx, DIM);
+    amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
+      const std::ptrdiff_t q = layout.offset(cell);
+      if (psi[q] <= CORE || !free_cell(grain[q])) return;
+      const auto g = static_cast<std::size_t>(grain[q]);
+      parts[at(b)].resize(crystals_.size());
+      parts[at(b)][g][0] += cell_volume;
+      parts[at(b)][g][1] += cell_volume * difference(alpha[q], moved[g].angle);
+    });
+  });
+  std::vector<amr::ExactSum> sums(2 * crystals_.size());
+  for (const auto& part : parts)
+    for (std::size_t g = 0; g < part.size(); ++g)
+      for (std::size_t k = 0; k < 2; ++k) sums[2 * g + k].add(part[g][k]);
+  const std::vector<double> total = amr::exact_sums(sums, mesh_->comm());
+  for (std::size_t g = 0; g < crystals_.size(); ++g)
+    if (total[2 * g] > 0) crystals_[g].turn(total[2 * g + 1] / total[2 * g]);
+}
+
+// The angle of its grain wherever eq. (4) has nothing to say, or in all cells.
+void Orientation::impose(const std::vector<Seed>& crystals, bool all) {
   const amr::Layout& layout = mesh_->layout();
   amr::parallel_for(mesh_->size(), [&](int b) {
     const double *psi = mesh_->cells(psi_, b), *grain = mesh_->cells(grain_, b);
@@ -104,19 +156,19 @@ void Orientation::impose(const std::vector<Seed>& crystals) {
     amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
       const std::ptrdiff_t q = layout.offset(cell);
       const Seed& crystal = crystals[static_cast<std::size_t>(grain[q])];
-      if (!crystal.touching || psi[q] <= LIQUID) alpha[q] = crystal.angle;
+      if (all || !free(crystal) || psi[q] <= LIQUID) alpha[q] = crystal.angle;
     });
   });
 }
 
 void Orientation::advance(double, double dt, std::int64_t) {
   if constexpr (DIM == 3) return;
+  welcome();
   std::vector<Seed> moved = crystals_;  // where they are at the end of the step
   for (Seed& s : moved) s.advance(dt);
-  const bool touching = std::any_of(moved.begin(), moved.end(), [](const Seed& s) { return s.touching; });
-  if (!touching) {
+  if (std::none_of(moved.begin(), moved.end(), [&](const Seed& s) { return free(s); })) {
     elapsed_ = 0;
-    impose(moved);
+    impose(moved, true);
     return;
   }
   const double crossing = fastest_crossing();
@@ -125,11 +177,12 @@ void Orientation::advance(double, double dt, std::int64_t) {
     for (int i = 0; i < steps; ++i) carry(dt / steps);
     turn(dt);
   }
-  impose(moved);
+  impose(moved, false);
   elapsed_ += dt;
   if (elapsed_ + 0.5 * dt >= options_.max_dt_tau0) {
     relax(elapsed_);
     elapsed_ = 0;
+    follow(moved);
   }
   extend(alpha_, LIQUID, crossing > 0 ? LAYERS_MOVING : LAYERS_AT_REST, true);
 }
@@ -201,7 +254,8 @@ void Orientation::turn(double dt) {
     });
   });
   const double interface = CORE - LIQUID;
-  extend(vorticity, CORE, static_cast<int>(std::ceil(interface / mesh_->shape().dx(mesh_->shape().max_level))) + 2, false);
+  const double finest = mesh_->shape().dx(mesh_->shape().max_level);
+  extend(vorticity, CORE, static_cast<int>(std::ceil(interface / finest)) + 2, false);
   amr::parallel_for(mesh_->size(), [&](int b) {
     const double* w = mesh_->cells(vorticity, b);
     double* alpha = mesh_->cells(alpha_, b);
@@ -212,11 +266,14 @@ void Orientation::turn(double dt) {
   });
 }
 
-// Cells below `least` copy the value of that neighbour with a value which has the largest psi, layer by layer. Two layers
-// of ghosts allow two layers at a time.
-void Orientation::extend(amr::CellField values, double least, int layers, bool touching_only) {
+// Cells below `least` copy the value of that neighbour with a value which has the largest psi, layer by layer. Two
+// layers of ghosts allow two layers at a time.
+void Orientation::extend(amr::CellField values, double least, int layers, bool free_only) {
   const amr::Layout& layout = mesh_->layout();
   const int n = layout.n;
+  std::array<std::ptrdiff_t, DIRECTIONS> around{};
+  for (int d = 0; d < DIRECTIONS; ++d)
+    for (int a = 0; a < DIM; ++a) around[at(d)] += direction_offset(d)[a] * layout.stride(a);
   for (int done = 0; done < layers; done += amr::Layout::GHOSTS) {
     if (done == 0) {
       ghosts_->fill({psi_, grain_, values});
@@ -239,11 +296,10 @@ void Orientation::extend(amr::CellField values, double least, int layers, bool t
         const int rim = 1 - layer;
         amr::for_each_cell(filled(-rim), filled(n + 2 * rim), [&](const IntVec& cell) {
           const std::ptrdiff_t q = layout.offset(cell);
-          if (valid[q] != 0 || (touching_only && !free_cell(grain[q]))) return;
+          if (valid[q] != 0 || (free_only && !free_cell(grain[q]))) return;
           double most = -2 * PSI_MAX;
-          for (int d = 0; d < DIRECTIONS; ++d) {
-            std::ptrdiff_t p = q;
-            for (int a = 0; a < DIM; ++a) p += direction_offset(d)[a] * layout.stride(a);
+          for (const std::ptrdiff_t way : around) {
+            const std::ptrdiff_t p = q + way;
             if (valid[p] != 1 || psi[p] <= most) continue;
             most = psi[p];
             value[q] = value[p];
@@ -253,7 +309,9 @@ void Orientation::extend(amr::CellField values, double least, int layers, bool t
         for (std::ptrdiff_t q = -layout.interior(); q < layout.size() - layout.interior(); ++q)
           valid[q] = static_cast<char>(valid[q] != 0);
       }
-      amr::for_each_cell({}, filled(n), [&](const IntVec& cell) { kept[layout.offset(cell)] = valid[layout.offset(cell)]; });
+      amr::for_each_cell({}, filled(n), [&](const IntVec& cell) {
+        kept[layout.offset(cell)] = valid[layout.offset(cell)];
+      });
     });
   }
 }
@@ -263,6 +321,8 @@ void Orientation::relax(double dt) {
   if (solver_ == nullptr || solver_generation_ != mesh_->generation()) {
     amr::ScalarOptions o;
     o.tolerance = options_.tolerance;
+    o.directions = 20;  // diffusivities differ by a factor of up to 1e6
+    o.max_iterations = 200;
     solver_ = std::make_unique<amr::ScalarSolver>(*mesh_, std::array<amr::MirrorRule, FACES>{}, o);
     solver_generation_ = mesh_->generation();
   }
@@ -277,7 +337,10 @@ double Orientation::sweep(double dt, bool first) {
   ghosts_->fill({psi_, grain_, alpha_});
   std::vector<double> most(at(mesh_->size()), 0.0);
   amr::parallel_for(mesh_->size(), [&](int b) { most[at(b)] = set_system(b, dt, first); });
-  const double force = amr::global_max(most.empty() ? 0.0 : *std::max_element(most.begin(), most.end()), mesh_->comm());
+  const auto largest = [&] {
+    return amr::global_max(most.empty() ? 0.0 : *std::max_element(most.begin(), most.end()), mesh_->comm());
+  };
+  const double force = largest();
   constexpr double NOTHING = 1e-13;  // rad
   if (force * dt / TAU_ALPHA < NOTHING) return 0;
   if (options_.p == Mobility::constant) {
@@ -288,21 +351,23 @@ double Orientation::sweep(double dt, bool first) {
   const amr::ScalarResult result = solver_->solve();
   iterations_ += result.iterations;
   if (!result.converged)
-    throw NumericalError(fmt::format("eq. (4) is not solved after {} iterations: residual {:.3g}, tolerance {:.3g}; a smaller "
-                                     "orientation.max_dt_tau0 may help", result.iterations, result.residual, options_.tolerance));
+    throw NumericalError(fmt::format("eq. (4) is not solved after {} iterations: residual {:.3g}, tolerance {:.3g}; a "
+                                     "smaller orientation.max_dt_tau0 may help",
+                                     result.iterations, result.residual, options_.tolerance));
   amr::parallel_for(mesh_->size(), [&](int b) {
     const auto [g, i] = solver_->hierarchy().place_of_block(b);
-    const double *change = solver_->solution().at(g, i, 0), *psi = mesh_->cells(psi_, b), *grain = mesh_->cells(grain_, b);
-    double *alpha = mesh_->cells(alpha_, b), largest = 0;
+    const double *change = solver_->solution().at(g, i, 0), *psi = mesh_->cells(psi_, b);
+    const double* grain = mesh_->cells(grain_, b);
+    double *alpha = mesh_->cells(alpha_, b), largest_here = 0;
     amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
       const std::ptrdiff_t q = layout.offset(cell);
       if (psi[q] <= LIQUID || !free_cell(grain[q])) return;
       alpha[q] += change[q];
-      largest = std::max(largest, std::abs(change[q]));
+      largest_here = std::max(largest_here, std::abs(change[q]));
     });
-    most[at(b)] = largest;
+    most[at(b)] = largest_here;
   });
-  return amr::global_max(most.empty() ? 0.0 : *std::max_element(most.begin(), most.end()), mesh_->comm());
+  return largest();
 }
 
 // P tau_alpha (alpha_new - alpha_old)/dt = div[(g s/|grad alpha| + h e^2) grad alpha_new] of block b for the unknown
@@ -338,7 +403,8 @@ double Orientation::set_system(int b, double dt, bool first) {
         if (c == a) continue;
         const std::ptrdiff_t t = layout.stride(c);
         const double along = (difference(alpha[q], alpha[q - t]) + difference(alpha[q + t], alpha[q]) +
-                              difference(alpha[q - s], alpha[q - s - t]) + difference(alpha[q - s + t], alpha[q - s])) / (4 * dx);
+                              difference(alpha[q - s], alpha[q - s - t]) + difference(alpha[q - s + t], alpha[q - s])) /
+                             (4 * dx);
         square += along * along;
       }
       const double f = 0.5 * (1 + phi_of_psi(0.5 * (psi[q] + psi[q - s])));
@@ -369,9 +435,7 @@ double Orientation::set_system(int b, double dt, bool first) {
 }
 
 void Orientation::before_tagging() {
-  std::vector<amr::CellField> fields{grain_};
-  if (alpha_.id >= 0) fields.push_back(alpha_);
-  ghosts_->fill(fields);
+  if (alpha_.id >= 0) ghosts_->fill({alpha_});
 }
 
 // Boundaries between grains stay on the finest level.
@@ -385,7 +449,8 @@ void Orientation::tag(int b, amr::Tag& tag) const {
     const std::ptrdiff_t s = layout.stride(a);
     amr::for_each_cell(filled(-1), filled(layout.n + 1), [&](const IntVec& cell) {
       const std::ptrdiff_t q = layout.offset(cell);
-      if (psi[q] > LIQUID && psi[q + s] > LIQUID && std::abs(difference(alpha[q + s], alpha[q])) > JUMP) found = true;
+      const bool solid = psi[q] > LIQUID && psi[q + s] > LIQUID;
+      if (solid && std::abs(difference(alpha[q + s], alpha[q])) > JUMP) found = true;
     });
   }
   if (found) tag.level = tag.keep = mesh_->shape().max_level;

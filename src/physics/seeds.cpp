@@ -193,6 +193,17 @@ void Seed::advance(double dt) {
   rotated = true;
 }
 
+void Seed::turn(double by) {
+  if (by == 0) return;
+  Seed turning = *this;
+  turning.velocity = {};
+  turning.spin = {0, 0, by};
+  turning.advance(1);
+  axes = turning.axes;
+  angle = turning.angle;
+  rotated = turning.rotated;
+}
+
 std::array<double, 4> quaternion(const Seed& crystal) {
   // Columns of the rotation matrix are the crystal's axes. Shepperd's method: divide by the largest component.
   Matrix3 m{};

@@ -47,6 +47,8 @@ struct Seed {
 
   /// Moves and turns for a time dt.
   void advance(double dt);
+  /// 2D: turns on the spot, counterclockwise.
+  void turn(double by);
   /// Semi-axes at the start, along crystal axis 0 and across it.
   std::array<double, 2> semi_axes() const;
   /// Distance from the surface at the start, positive inside; r: place relative to the centre.

@@ -147,7 +147,7 @@ void Solidification::run_stage(const Stage& stage, double noise, std::uint64_t n
     AlloyParameters own = parameters_;
     local_axes_.apply(b, k, own);
     BlockKind kind = classify(k.psi, layout.n);
-    if (kind == BlockKind::solid && local_axes_.mixed(b)) kind = BlockKind::interface;  // a boundary of grains may form
+    if (kind == BlockKind::solid && local_axes_.disordered(b)) kind = BlockKind::interface;
     advance_alloy(k, kind, own, stage, layout.n);
     if (measure) block_cost_[static_cast<std::size_t>(b)] = {omp_get_wtime() - begin, static_cast<double>(kind)};
   });

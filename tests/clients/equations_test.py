@@ -25,14 +25,17 @@ print(text.strip())
 BREAKS = [
     (KERNEL, "Eq. (2):", "Eq. (99):", "Eq. (99) has no section"),  # also: the last mention of (2) in that file
     (KERNEL, "Eq. (2):", "Here", f"{KERNEL}, which does not mention Eq. (2)"),
-    (KERNEL, "Eq. (2):", "Eqs. (2)\n// and (4):", "Eq. (4), of which"),
+    (KERNEL, "Eq. (2):", "Eqs. (2)\n// and (4):", "Eq. (4), but"),
     (KERNEL, "void phase_rate(", "void other_rate(", f"phase_rate, which {KERNEL} does not have"),
     ("src/physics/scales.cpp", "namespace dendrift", "// see eq. (1)\nnamespace dendrift", "does not name this file"),
     ("docs/equations.md", "(`phase_rate`,", "(`phase_speed`,", "names phase_speed"),
     ("docs/equations.md", f"`{KERNEL}` (`phase_rate`", "`src/physics/alloy.cpp` (`phase_rate`", "which does not exist"),
     ("docs/equations.md", "## Eq. (3)", "## Eq. (33)", "Eq. (3) has no section"),
-    ("docs/equations.md", "## Eq. (4): orientation\n\nNot in the code yet.", "## Eq. (4): orientation", "neither"),
-    ("docs/equations.md", "Not in the code yet.", "Not in the code yet.\n\nCode: `src/main.cpp`", "has a Code line and"),
+    ("docs/equations.md", "## Eq. (4): orientation\n\nCode:", "## Eq. (4): orientation\n\nSource:", "neither"),
+    ("docs/equations.md", "## Eq. (4): orientation\n\nCode:", "## Eq. (4): orientation\n\nNot in the code yet.\n\nSource:",
+     "Eq. (4), of which"),
+    ("docs/equations.md", "## Eq. (4): orientation\n\nCode:", "## Eq. (4): orientation\n\nNot in the code yet.\n\nCode:",
+     "has a Code line and"),
 ]
 for file, old, new, wanted in BREAKS:
     with tempfile.TemporaryDirectory(prefix="dendrift_test_") as folder:

@@ -75,6 +75,28 @@ position_W0 = [180, 80]
 radius_W0 = 5
 angle_deg = 20
 """),
+    # two crystals of different angle that grow together and turn with the flow: the field of angles is carried and solved
+    "2D orientation": (dict(lines=0.5, steps=81, omega=0.35), """
+[mesh]
+dim = 2
+size_W0 = [128, 64]
+root_blocks = [2, 1]
+levels = 4
+block_cells = 8
+max_regrid_steps = 4
+[[seed]]
+position_W0 = [54, 32]
+radius_W0 = 9
+angle_deg = 10
+[[seed]]
+position_W0 = [74, 30]
+radius_W0 = 9
+angle_deg = 50
+[orientation]
+max_dt_tau0 = 0.5
+[flow]
+velocity_gradient_per_tau0 = [0, -0.02, 0.02, 0]
+"""),
     # a crystal carried across both pairs of periodic sides
     "2D drift": (dict(lines=2, steps=129, omega=0.3), MESH_2D + """
 size_W0 = [128, 64]

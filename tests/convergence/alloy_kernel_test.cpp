@@ -197,6 +197,48 @@ TEST(AlloyKernel, PhaseRateIsSecondOrder) {
   }
 }
 
+// Arrays of axes and disorder for a whole block.
+struct OwnAxes {
+  std::vector<std::vector<double>> arrays;
+  OwnAxes(AlloyBlock& block, const AlloyParameters& par, double disorder) {
+    const auto size = static_cast<std::size_t>(std::pow(N + 2 * G, DIM));
+    for (int i = 0; i < DIM; ++i)
+      for (int a = 0; a < DIM; ++a) arrays.emplace_back(size, par.axes[i][a]);
+    arrays.emplace_back(size, disorder);
+    for (int i = 0; i < DIM; ++i)
+      for (int a = 0; a < DIM; ++a) block.axes[i][a] = arrays[static_cast<std::size_t>(i * DIM + a)].data() + offset({});
+    block.disorder = arrays.back().data() + offset({});
+  }
+};
+
+// The same axes in every cell give what the axes of the block give; disorder w adds -w/[sqrt2 (1-phi) a_s^2], as far as
+// FASTEST_PULL.
+TEST(AlloyKernel, AxesAndDisorderOfEachCell) {
+  for (const double disorder : {0.0, 0.3, 20.0}) {
+    const AlloyParameters par = turned(0.05, 0.4);
+    RealVec lo = filled_real(8.0);
+    if (DIM == 3) lo[DIM - 1] = 2.0;
+    TestBlock b(0.7, lo, bumpy, [](const RealVec&) { return -0.1; }, par.k);
+    std::vector<double> without(static_cast<std::size_t>(std::pow(N, DIM))), with = without;
+    psi_rate(b.view, par, N, without);
+    const OwnAxes own(b.view, par, disorder);
+    psi_rate(b.view, par, N, with);
+    std::size_t i = 0;
+    int bounded = 0;
+    amr::for_each_cell({}, filled(N), [&](const IntVec& cell) {
+      RealVec x{};
+      for (int a = 0; a < DIM; ++a) x[a] = lo[a] + (cell[a] + 0.5) * 0.7;
+      const double phi = phi_of_psi(b.view.psi[offset(cell) - offset({})]), a_s = a_s_of(bumpy_gradient(x), par);
+      const double pull = disorder / (SQRT2 * (1 - phi) * a_s * a_s);
+      if (pull > FASTEST_PULL) ++bounded;
+      // a_s of differences and of the function are not the same.
+      EXPECT_NEAR(with[i] - without[i], -std::min(pull, FASTEST_PULL), 0.03 * std::min(pull, FASTEST_PULL) + 1e-12);
+      ++i;
+    });
+    EXPECT_EQ(bounded > 0, disorder > 1) << disorder;
+  }
+}
+
 TEST(AlloyKernel, RotatedPathEqualsPlainPathAtNoTurn) {
   AlloyParameters plain = parameters(0.05), path = parameters(0.05);
   path.rotated = true;

@@ -205,6 +205,54 @@ TEST(Transfer, ProlongBoxIsExactForQuadratics) {
   EXPECT_TRUE(tally.result());
 }
 
+// A plane of angles, each moved by any number of periods: exact both ways, modulo the period.
+TEST(Transfer, AnglesAreEqualModuloThePeriod) {
+  constexpr double PERIOD = M_PI / 2;
+  const auto plane = [](const RealVec& x) {
+    double v = 0.3;
+    for (int a = 0; a < DIM; ++a) v += (a == 0 ? 0.9 : -0.4) * x[a];
+    return v;
+  };
+  Random random(11);
+  const auto moved = [&](double v) { return v + PERIOD * (random.below(7) - 3); };
+  Field coarse(filled(6), 6), fine(filled(12), 7), back(filled(6), 8);
+  coarse.for_each([&](const IntVec& c) { *coarse.ref().at(c) = moved(plane(centre(c, 0.5))); });
+  prolong_angles(fine.ref(), filled(0), std::as_const(coarse).ref(), filled(12), PERIOD);
+  test::Tally tally;
+  for_each_cell(filled(0), filled(12), [&](const IntVec& c) {
+    tally.near(wrapped(*fine.ref().at(c) - plane(centre(c, 0.25)), PERIOD), 0, 1e-13, [&] { return test::text(c); });
+  });
+  fine.for_each([&](const IntVec& c) { *fine.ref().at(c) = moved(plane(centre(c, 0.25))); });
+  restrict_angles(back.ref(), filled(0), std::as_const(fine).ref(), filled(0), filled(6), PERIOD);
+  for_each_cell(filled(0), filled(6), [&](const IntVec& c) {
+    tally.near(wrapped(*back.ref().at(c) - plane(centre(c, 0.5)), PERIOD), 0, 1e-13, [&] { return test::text(c); });
+  });
+  EXPECT_TRUE(tally.result());
+}
+
+// Where two values meet, children have one of them; labels are never mixed.
+TEST(Transfer, StepsOfAnglesAndLabelsStaySteps) {
+  Field coarse(filled(6), 6), fine(filled(12), 7), back(filled(6), 8);
+  coarse.for_each([&](const IntVec& c) { *coarse.ref().at(c) = c[0] + c[1] < 5 ? 0.1 : 0.7; });
+  test::Tally tally;
+  for (const bool labels : {false, true}) {
+    if (labels) {
+      prolong_labels(fine.ref(), filled(0), std::as_const(coarse).ref(), filled(12));
+      restrict_labels(back.ref(), filled(0), std::as_const(fine).ref(), filled(0), filled(6));
+    } else {
+      prolong_angles(fine.ref(), filled(0), std::as_const(coarse).ref(), filled(12), M_PI / 2);
+      restrict_angles(back.ref(), filled(0), std::as_const(fine).ref(), filled(0), filled(6), M_PI / 2);
+    }
+    for_each_cell(filled(0), filled(12), [&](const IntVec& c) {
+      tally.bits(*fine.ref().at(c), c[0] / 2 + c[1] / 2 < 5 ? 0.1 : 0.7, [&] { return test::text(c); });
+    });
+    for_each_cell(filled(0), filled(6), [&](const IntVec& c) {
+      tally.bits(*back.ref().at(c), *coarse.ref().at(c), [&] { return test::text(c); });
+    });
+  }
+  EXPECT_TRUE(tally.result());
+}
+
 TEST(Transfer, RestrictionUndoesProlongation) {
   const Field coarse(filled(6), 8);
   Field fine(filled(12), 9), back(filled(6), 10);
