@@ -650,8 +650,11 @@ void Flow::solve(double elapsed) {
   unbalanced_ = unbalanced();
   // What is left may be small in the melt's norm and yet be the torque of a crystal, which from one good first guess to the next
   // would swing undamped.
-  constexpr double TIGHTER = 0.2;
-  for (double wanted = TIGHTER * tolerance(); result_.converged && unbalanced_ > options_.crystal_tolerance; wanted *= TIGHTER) {
+  constexpr double TIGHTER = 0.2, TIGHTEST = 1e-3, NOTHING = 1e-9;  // of the tolerance; cells
+  const double least = TIGHTEST * tolerance();
+  const bool moves = fastest_ * elapsed > NOTHING * phase_mesh_->shape().dx(phase_mesh_->shape().max_level);
+  for (double wanted = TIGHTER * tolerance();
+       result_.converged && moves && unbalanced_ > options_.crystal_tolerance && wanted > least; wanted *= TIGHTER) {
     const int before = result_.iterations;
     result_ = solver_->improve(wanted);
     result_.iterations += before;
