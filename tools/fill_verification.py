@@ -120,6 +120,11 @@ TABLES = {
     "offsets": lambda: map(lambda r: [r["law"], r["R_W0"], r["ratio"], num(r["offset_W0"], 3), r["reference"],
                                       f"{float(r['nonrigidity']):.1e}"], rows("offsets")),
     "splitting": lambda: map(splitting, rows("splitting")), "flow_steps": lambda: map(flow_steps, rows("flow_steps")),
+    "rising": lambda: map(lambda r: [r["tolerance"], num(r["rising"], 7), num(r["falling"], 7), num(r["difference_percent"], 4) + " %"], rows("rising")),
+    "turned": lambda: map(lambda r: [r["dx_W0"], *(num(r[k + "_percent"], 3) + " %" for k in ("arms_differ", "length", "speed", "radius")),
+                                     f"{float(r['drift']):.0e}"], rows("turned")),
+    "sheared": lambda: map(lambda r: [r["model"], *(f"{float(r[k]):.4g}" for k in ("spin", "least", "most")), num(r["turned_deg"], 2)],
+                           rows("sheared")),
     "width": width_rows, "karma": karma_rows,
 }
 
