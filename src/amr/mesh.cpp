@@ -1,6 +1,7 @@
 #include "amr/mesh.hpp"
 
 #include <algorithm>
+#include <cmath>
 #include <cstdlib>
 #include <new>
 #include <numeric>
@@ -30,6 +31,17 @@ RealVec MeshShape::hi() const {
   RealVec h = lo;
   for (int a = 0; a < DIM; ++a) h[a] += root_blocks[a] * block_cells * root_dx;
   return h;
+}
+
+RealVec MeshShape::way(const RealVec& from, const RealVec& to) const {
+  RealVec r{};
+  for (int a = 0; a < DIM; ++a) {
+    r[a] = to[a] - from[a];
+    if (sides[static_cast<std::size_t>(2 * a)] != Side::periodic) continue;
+    const double extent = root_blocks[a] * block_cells * root_dx;
+    r[a] -= extent * std::round(r[a] / extent);
+  }
+  return r;
 }
 
 void Mesh::Free::operator()(double* p) const { std::free(p); }

@@ -41,6 +41,12 @@ struct Block {
   BlockIndex index;
   double dx = 0;  ///< cell spacing
   RealVec lo{};   ///< low corner
+
+  RealVec centre(const IntVec& cell) const {
+    RealVec x{};
+    for (int a = 0; a < DIM; ++a) x[a] = lo[a] + (cell[a] + 0.5) * dx;
+    return x;
+  }
 };
 
 enum class Side : std::uint8_t { wall, symmetry, open, periodic };
@@ -56,6 +62,8 @@ struct MeshShape {
   Array<bool> periodic() const;
   double dx(int level) const { return root_dx / static_cast<double>(1 << level); }
   RealVec hi() const;
+  /// The way from one point to another, or to its nearest image.
+  RealVec way(const RealVec& from, const RealVec& to) const;
 };
 
 /// Owns the arrays. Lengths are in the unit of MeshShape (Dendrift: W0). All ranks hold the same tree and owners.

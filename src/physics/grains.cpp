@@ -64,14 +64,7 @@ void Grains::attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) {
 }
 
 RealVec Grains::from_centre(const Seed& seed, const amr::Block& block, const IntVec& cell) const {
-  const Array<bool> periodic = mesh_->shape().periodic();
-  const RealVec lo = mesh_->shape().lo, hi = mesh_->shape().hi();
-  RealVec r{};
-  for (int a = 0; a < DIM; ++a) {
-    r[a] = block.lo[a] + (cell[a] + 0.5) * block.dx - seed.position[a];
-    if (periodic[a]) r[a] -= std::round(r[a] / (hi[a] - lo[a])) * (hi[a] - lo[a]);
-  }
-  return r;
+  return mesh_->shape().way(seed.position, block.centre(cell));
 }
 
 // The crystal that a cell lies in, or whose surface is nearest.

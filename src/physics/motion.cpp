@@ -56,10 +56,9 @@ class Solid {
         constexpr double NEGLIGIBLE = 1e-6;
         if (f < NEGLIGIBLE) return;
         part.resize(width * crystals_.size());
-        RealVec x{}, v{};
-        for (int a = 0; a < DIM; ++a) {
-          x[a] = block.lo[a] + (q[a] + 0.5) * block.dx;
-          if (velocity_.id < 0) continue;
+        const RealVec x = block.centre(q);
+        RealVec v{};
+        for (int a = 0; a < DIM && velocity_.id >= 0; ++a) {
           const double* u = mesh_.faces(velocity_, a, b) + o;
           v[a] = 0.5 * (u[0] + u[layout.stride(a)]);
         }
@@ -81,12 +80,12 @@ class Solid {
   void find_crystal(const RealVec& x, int b, std::ptrdiff_t cell, Sample& s) const {
     if (grain_.id >= 0) {
       s.crystal = static_cast<std::size_t>(mesh_.cells(grain_, b)[cell]);
-      s.r = widened(way(crystals_[s.crystal], x));
+      s.r = widened(mesh_.shape().way(crystals_[s.crystal].position, x));
       return;
     }
     double least = 1e300;
     for (std::size_t g = 0; g < crystals_.size(); ++g) {
-      const Vector3 r = widened(way(crystals_[g], x));
+      const Vector3 r = widened(mesh_.shape().way(crystals_[g].position, x));
       const double square = dot(r, r);
       if (square >= least) continue;
       least = square;
@@ -96,18 +95,6 @@ class Solid {
   }
 
  private:
-  // From the crystal's centre, or from its nearest image.
-  RealVec way(const Seed& crystal, const RealVec& x) const {
-    const RealVec lo = mesh_.shape().lo, hi = mesh_.shape().hi();
-    const Array<bool> periodic = mesh_.shape().periodic();
-    RealVec r{};
-    for (int a = 0; a < DIM; ++a) {
-      r[a] = x[a] - crystal.position[a];
-      if (periodic[a]) r[a] -= (hi[a] - lo[a]) * std::round(r[a] / (hi[a] - lo[a]));
-    }
-    return r;
-  }
-
   const amr::Mesh& mesh_;
   amr::CellField psi_, grain_;
   amr::FaceField velocity_;
@@ -139,10 +126,8 @@ std::vector<Load> net_loads(const amr::Mesh& mesh, amr::CellField psi, amr::Cell
       constexpr double MELT = -0.99;
       const std::ptrdiff_t o = layout.offset(q);
       if (phi_of_psi(phase[o]) < MELT) return;
-      RealVec x{};
-      for (int a = 0; a < DIM; ++a) x[a] = block.lo[a] + (q[a] + 0.5) * block.dx;
       Sample s{};
-      solid.find_crystal(x, b, o, s);
+      solid.find_crystal(block.centre(q), b, o, s);
       parts[at(b)].resize(WIDTH * crystals.size());
       double* part = parts[at(b)].data() + s.crystal * WIDTH;
       Vector3 f{};

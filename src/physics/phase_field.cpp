@@ -47,19 +47,11 @@ void set_seeds(amr::Mesh& mesh, amr::CellField psi, const std::vector<Seed>& see
   const amr::Block& block = mesh.block(b);
   const amr::Layout& layout = mesh.layout();
   double* p = mesh.cells(psi, b);
-  const Array<bool> periodic = mesh.shape().periodic();
-  RealVec extent = mesh.shape().hi();
-  for (int a = 0; a < DIM; ++a) extent[a] -= mesh.shape().lo[a];
   amr::for_each_cell({}, filled(layout.n), [&](const IntVec& c) {
     double value = -PSI_MAX;
     for (const Seed& s : seeds) {
       if (!s.present) continue;
-      RealVec r{};
-      for (int a = 0; a < DIM; ++a) {
-        r[a] = block.lo[a] + (c[a] + 0.5) * block.dx - s.position[a];
-        if (periodic[a]) r[a] -= std::round(r[a] / extent[a]) * extent[a];  // the nearest image
-      }
-      value = std::max(value, s.depth(r));
+      value = std::max(value, s.depth(mesh.shape().way(s.position, block.centre(c))));
     }
     p[layout.offset(c)] = std::min(value, PSI_MAX);
   });

@@ -31,8 +31,6 @@ void RigidBodies::build(const amr::Hierarchy& hierarchy, const amr::HierarchyFie
   hierarchy_ = &hierarchy;
   const amr::Mesh& mesh = hierarchy.mesh();
   const amr::Layout& layout = mesh.layout();
-  const RealVec lo = mesh.shape().lo, hi = mesh.shape().hi();
-  const Array<bool> periodic = mesh.shape().periodic();
   faces_.assign(at(mesh.size()), {});
   motions_.assign(centres.size(), {});
   if (centres.empty()) return;
@@ -50,22 +48,16 @@ void RigidBodies::build(const amr::Hierarchy& hierarchy, const amr::HierarchyFie
         const std::ptrdiff_t place = layout.offset(q);
         if (k[place] <= 0) return;
         Face f{place, axis, 0, k[place], std::pow(block.dx, DIM), {}};
-        const auto arm_from = [&](std::size_t n) {
-          RealVec arm{};
-          for (int a = 0; a < DIM; ++a) {
-            arm[a] = block.lo[a] + (q[a] + (a == axis ? 0.0 : 0.5)) * block.dx - centres[n][a];
-            if (periodic[a]) arm[a] -= (hi[a] - lo[a]) * std::round(arm[a] / (hi[a] - lo[a]));
-          }
-          return arm;
-        };
+        RealVec on_face = block.centre(q);
+        on_face[axis] = block.lo[axis] + q[axis] * block.dx;
         if (labels != nullptr) {
           f.body = owners.body[static_cast<std::size_t>(labels[place])];
           if (f.body == HELD) return;
-          f.arm = arm_from(at(f.body));
+          f.arm = mesh.shape().way(centres[at(f.body)], on_face);
         } else {
           double least = 1e300;
           for (std::size_t n = 0; n < centres.size(); ++n) {
-            const RealVec arm = arm_from(n);
+            const RealVec arm = mesh.shape().way(centres[n], on_face);
             double square = 0;
             for (const double x : arm) square += x * x;
             if (square >= least) continue;

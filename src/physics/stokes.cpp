@@ -465,18 +465,18 @@ StokesResult StokesSolver::solve(double sigma) {
     finish(x, result);
     return result;
   }
-  return iterate(std::move(x), options_.tolerance);
+  return iterate(std::move(x), options_.tolerance, options_.max_iterations);
 }
 
-StokesResult StokesSolver::improve(double tolerance) {
+StokesResult StokesSolver::improve(double tolerance, int max_iterations) {
   Vector x;
   pack(state_, x);
-  return iterate(std::move(x), tolerance);
+  return iterate(std::move(x), tolerance, max_iterations);
 }
 
-StokesResult StokesSolver::iterate(Vector x, double tolerance) {
+StokesResult StokesSolver::iterate(Vector x, double tolerance, int max_iterations) {
   amr::GmresOptions o;
-  o.max_iterations = options_.max_iterations;
+  o.max_iterations = max_iterations;
   o.tolerance = tolerance;
   const amr::GmresResult g = gmres_.solve(x, pieces_, o, [this](const Vector& now) { return size(now); });
   StokesResult result;

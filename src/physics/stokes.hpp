@@ -65,7 +65,7 @@ class StokesSolver {
 
   StokesResult solve(double sigma);
   /// Goes on from the last solution to a smaller tolerance.
-  StokesResult improve(double tolerance);
+  StokesResult improve(double tolerance, int max_iterations);
   /// What the last solution leaves of the momentum equation, on the unknown faces of the leaves. Faces that finer leaves
   /// own, and those of walls, hold nothing of use.
   const amr::HierarchyField& residual() const { return image_; }
@@ -90,7 +90,7 @@ class StokesSolver {
   void cycle_pressure(amr::HierarchyField& r);
   void cycle_velocity(amr::HierarchyField& r);
   void cycle_momentum(amr::HierarchyField& r);
-  StokesResult iterate(Vector x, double tolerance);
+  StokesResult iterate(Vector x, double tolerance, int max_iterations);
   StokesResult project(Vector& x);
   void project_pass(Vector& x, StokesResult& result);
   void subtract_gradient(const amr::HierarchyField& p, double factor, amr::HierarchyField& v) const;
