@@ -165,16 +165,27 @@ position_W0 = [18.3, 3.1, 21.7]
 radius_W0 = 6
 euler_deg = [10, 30, 50]
 """),
-    "3D grains": (dict(lines=0.2, steps=25, omega=0.3), MESH_3D + """
-[seeds]
-count = 3
-generator = 4
-radius_W0 = 6
-clearance_W0 = 2
-last_nucleation_time_tau0 = 1
+    # crystals in touch, and one that comes later, carried across periodic sides
+    "3D grains": (dict(lines=0.2, steps=65, omega=0.3), MESH_3D + """
+xlo = "periodic"
+xhi = "periodic"
+ylo = "periodic"
+yhi = "periodic"
+zlo = "periodic"
+zhi = "periodic"
+[[seed]]
+position_W0 = [24, 32, 32]
+radius_W0 = 5
+euler_deg = [10, 30, 50]
+[[seed]]
+position_W0 = [33, 32, 32]
+radius_W0 = 5
+[[seed]]
+position_W0 = [32, 10, 12]
+radius_W0 = 4
+nucleation_time_tau0 = 1
 [flow]
-max_interval_tau0 = 0.4
-gravity_um_s2 = 3e9
+velocity_W0_tau0 = [3, 1, -2]
 """),
     "3D drift": (dict(lines=0.2, steps=33, omega=0.2), MESH_3D + """
 xlo = "periodic"
