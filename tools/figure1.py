@@ -19,8 +19,10 @@ ROOT = Path(__file__).resolve().parent.parent
 
 
 def read(path):
+    """Whole lines; a restarted run may have more columns than before, a killed one half a line at the end."""
     with open(path, encoding="utf-8") as file:
-        return [{k: float(v) for k, v in row.items()} for row in csv.DictReader(file) if None not in row.values()]
+        rows = [{k: float(v) for k, v in row.items() if k and v} for row in csv.DictReader(file)]
+    return [r for r in rows if len(r) >= len(rows[0])]
 
 
 def table(folder, every):

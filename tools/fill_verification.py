@@ -146,6 +146,7 @@ def main():
             table = ["| " + " | ".join(r) + " |" for r in TABLES[case]()]
             if case != "karma":
                 out += table
+                case = None  # later tables, with no command of their own, are written by hand
         if in_table and line.startswith("| print"):
             out += table
     open(path, "w").write("\n".join(out))

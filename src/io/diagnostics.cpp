@@ -6,6 +6,7 @@
 #include <cerrno>
 #include <cmath>
 #include <cstring>
+#include <filesystem>
 #include <fstream>
 #include <sstream>
 
@@ -20,6 +21,14 @@ std::string number_text(double x) {
 
 namespace {
 
+void set_aside(const std::string& path) {
+  std::string name = path + ".old";
+  for (int i = 2; std::filesystem::exists(name); ++i) name = fmt::format("{}.old{}", path, i);
+  std::error_code error;
+  std::filesystem::rename(path, name, error);
+  if (error) throw OutputError(path, "set the file aside, whose columns are those of another version", error.message());
+}
+
 // Complete lines of an earlier run whose time is not after `last_time`, header first.
 std::string kept_lines(const std::string& path, std::string_view header, std::string_view time_column, double last_time) {
   std::string kept(header);
@@ -33,7 +42,10 @@ std::string kept_lines(const std::string& path, std::string_view header, std::st
   std::istringstream lines(text);
   std::string line;
   std::getline(lines, line);
-  if (line != header) return kept;  // another version's columns: start anew
+  if (line != header) {  // another version's columns: they stay, under another name
+    if (!text.empty()) set_aside(path);
+    return kept;
+  }
   while (std::getline(lines, line)) {
     std::istringstream cells(line);
     std::string cell;
