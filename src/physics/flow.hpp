@@ -130,6 +130,7 @@ class Flow : public Module {
   void complete();
   void extrapolate(double elapsed);
   void set_viscosity();
+  void set_whirls();
   bool held(const Seed& crystal) const { return options_.motion == Motion::held || crystal.held; }
   bool penalised() const {
     return options_.solid == SolidModel::penalised || std::ranges::any_of(crystals_, [this](const Seed& s) { return held(s); });
