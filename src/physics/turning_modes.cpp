@@ -13,8 +13,8 @@ namespace {
 
 std::size_t at(int i) { return static_cast<std::size_t>(i); }
 
-// Rate of rotation at a distance r over that of the solid: h = 1, a r^-DIM + b, 0; and g with dg/dr = -h r, 0 at the reach,
-// whose curl is the velocity.
+// Rate of rotation at a distance r over that of the solid: h = 1, then a r^-DIM + b, then 0. And g with dg/dr = -h r, 0
+// at the reach, whose curl is the velocity.
 class Profile {
  public:
   explicit Profile(const Whirl& w) : whirl_(w) {
@@ -109,7 +109,8 @@ void TurningModes::build(const amr::Hierarchy& hierarchy, const std::vector<amr:
           const double low = r[at(e)] - 0.5 * dx, high = r[at(e)] + 0.5 * dx, rest = square - r[at(e)] * r[at(e)];
           const bool rigid = profile.rigid(rest + low * low) && profile.rigid(rest + high * high);
           // To the last digit where nothing may be sheared.
-          const double slope = rigid ? -r[at(e)] : (profile.stream(rest + high * high) - profile.stream(rest + low * low)) / dx;
+          const double slope =
+              rigid ? -r[at(e)] : (profile.stream(rest + high * high) - profile.stream(rest + low * low)) / dx;
           f.mode[at(k)] = sign * slope;
         }
         faces_[at(b)].push_back(f);

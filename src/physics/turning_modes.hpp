@@ -9,8 +9,8 @@
 
 namespace dendrift::physics {
 
-/// A disc (sphere) that holds all of a solid, and the larger one that its rotation may stir: the two hold no other solid,
-/// and no face of the larger one lies in that of another whirl.
+/// A disc (sphere) that holds all of a solid, and a larger one round it that its rotation may stir. The larger ones of
+/// different solids do not overlap.
 struct Whirl {
   RealVec centre{};
   double radius = 0, reach = 0;
@@ -22,8 +22,9 @@ class TurningModes {
  public:
   static constexpr int AXES = DIM == 2 ? 1 : 3;
 
-  /// `velocities`: the components of velocity, as of all fields that are handed over later.
-  void build(const amr::Hierarchy& hierarchy, const std::vector<amr::Component>& velocities, const std::vector<Whirl>& whirls);
+  /// `velocities`: the first components of all fields that are handed over later.
+  void build(const amr::Hierarchy& hierarchy, const std::vector<amr::Component>& velocities,
+             const std::vector<Whirl>& whirls);
   bool empty() const { return inverse_.empty(); }
 
   /// v = the unit rotations of all whirls about an axis, on the leaves.

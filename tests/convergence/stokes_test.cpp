@@ -301,7 +301,8 @@ TEST(Stokes, WrongSpinOfAFirstGuess) {
     }
     solver.set_viscosity(
         [&](int b, double* phi) {
-          for_all(mesh.layout(), [&](const IntVec& q) { phi[mesh.layout().offset(q)] = disc.phi(place(mesh.block(b), q, -1)); });
+          for_all(mesh.layout(),
+                  [&](const IntVec& q) { phi[mesh.layout().offset(q)] = disc.phi(place(mesh.block(b), q, -1)); });
         },
         [](double phi) { return physics::relative_viscosity(physics::ViscosityLaw::h3, 1e6, phi); });
     if (whirl) solver.set_whirls({{disc.centre, radius + 4, 4 * radius}});

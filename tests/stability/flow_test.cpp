@@ -325,7 +325,8 @@ TEST(HardFlow, GrowingCrystal) {
 TEST(HardFlow, SmallDiscInAWideStream) {
   for (const double gamma : {2e-3, -2e-2}) {
     Scene scene(rigid_scene(place(256, 256), seed("[128, 128]", 8)),
-                {"flow.gravity_um_s2=0", fmt::format("flow.wall_gradient_per_tau0=[0, {}, 0, 0]", gamma), "flow.crystal_tolerance=1"});
+                {"flow.gravity_um_s2=0", fmt::format("flow.wall_gradient_per_tau0=[0, {}, 0, 0]", gamma),
+                 "flow.crystal_tolerance=1"});
     const std::string what = fmt::format("gamma = {}", gamma);
     for (int i = 1; i <= 10; ++i) {
       follow(scene, 10 + 2 * i, what);  // the melt is set in motion from the walls before
