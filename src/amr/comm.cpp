@@ -79,6 +79,11 @@ double global_max(double x, MPI_Comm comm) {
   return x;
 }
 
+std::vector<double> global_max(std::vector<double> x, MPI_Comm comm) {
+  MPI_Allreduce(MPI_IN_PLACE, x.data(), static_cast<int>(x.size()), MPI_DOUBLE, MPI_MAX, comm);
+  return x;
+}
+
 double global_min(double x, MPI_Comm comm) {
   MPI_Allreduce(MPI_IN_PLACE, &x, 1, MPI_DOUBLE, MPI_MIN, comm);
   return x;

@@ -30,6 +30,7 @@ class ExactSum {
 std::vector<double> exact_sums(std::span<ExactSum> local, MPI_Comm comm);
 
 double global_max(double x, MPI_Comm comm);
+std::vector<double> global_max(std::vector<double> x, MPI_Comm comm);  ///< of each entry
 double global_min(double x, MPI_Comm comm);
 bool global_any(bool x, MPI_Comm comm);
 

@@ -470,6 +470,34 @@ void Flow::set_viscosity() {
   solver_->set_drag(phase, [&](double phi) { return nu * relative_drag(phi); }, centres, owners);
 }
 
+// Round each crystal that may turn: as far as walls and half the gaps to others let it, and no further than what makes a
+// difference. Crystals among the arms of others have none.
+void Flow::set_whirls() {
+  std::vector<Whirl> whirls;
+  if (options_.coupling == Coupling::coupled && !penalised() && options_.stress == Stress::symmetric && !crystals_.empty()) {
+    constexpr double WIDEST = 4, NARROWEST = 1.1;  // reach over radius
+    const std::vector<double> radii = extents(*mesh_, now_.psi, now_.grain, crystals_);
+    const amr::MeshShape& shape = mesh_->shape();
+    const RealVec lo = shape.lo, hi = shape.hi();
+    const Array<bool> periodic = shape.periodic();
+    for (std::size_t g = 0; g < crystals_.size(); ++g) {
+      if (!(radii[g] > 0)) continue;
+      const RealVec& centre = crystals_[g].position;
+      double reach = WIDEST * radii[g];
+      for (int a = 0; a < DIM; ++a)
+        reach = std::min(reach, periodic[a] ? 0.5 * (hi[a] - lo[a]) : std::min(centre[a] - lo[a], hi[a] - centre[a]));
+      for (std::size_t k = 0; k < crystals_.size(); ++k) {
+        if (k == g || !(radii[k] > 0)) continue;
+        double square = 0;
+        for (const double r : shape.way(centre, crystals_[k].position)) square += r * r;
+        reach = std::min(reach, 0.5 * (std::sqrt(square) + radii[g] - radii[k]));
+      }
+      if (reach > NARROWEST * radii[g]) whirls.push_back({centre, radii[g], reach});
+    }
+  }
+  solver_->set_whirls(whirls);
+}
+
 // Eqs. (5) and (6): what is known of the momentum at the end of the interval.
 void Flow::set_force(double sigma) {
   const amr::Layout& layout = mesh_->layout();
@@ -652,6 +680,7 @@ void Flow::solve(double elapsed) {
   ghosts_->fill(seen);
   load();
   set_viscosity();
+  set_whirls();
   const double sigma = 1 / elapsed;
   set_force(sigma);
   const Array<bool> unheld_axes = unheld();

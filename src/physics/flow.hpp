@@ -50,7 +50,7 @@ struct FlowOptions {
   int projections = 1;
   bool rotational = true;
   double tolerance = 1e-5;
-  double crystal_tolerance = 3e-3;
+  double crystal_tolerance = 1e-3;
   int max_iterations = 300;
   int coarser_levels = 0;
   double courant = 0.5, max_interval_tau0 = 4, max_change = 0.05;
@@ -130,6 +130,7 @@ class Flow : public Module {
   void complete();
   void extrapolate(double elapsed);
   void set_viscosity();
+  void set_whirls();
   bool held(const Seed& crystal) const { return options_.motion == Motion::held || crystal.held; }
   bool penalised() const {
     return options_.solid == SolidModel::penalised || std::ranges::any_of(crystals_, [this](const Seed& s) { return held(s); });

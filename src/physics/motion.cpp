@@ -153,6 +153,32 @@ std::vector<Load> net_loads(const amr::Mesh& mesh, amr::CellField psi, amr::Cell
   return net;
 }
 
+std::vector<double> extents(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain,
+                            const std::vector<Seed>& crystals) {
+  const amr::Layout& layout = mesh.layout();
+  const Solid solid(mesh, psi, grain, {}, crystals);
+  std::vector<std::vector<double>> parts(at(mesh.size()));
+  amr::parallel_for(mesh.size(), [&](int b) {
+    const amr::Block& block = mesh.block(b);
+    amr::for_each_cell({}, filled(layout.n), [&](const IntVec& q) {
+      constexpr double STIFF = -1;  // from here inwards the viscosity is not that of the melt
+      const std::ptrdiff_t o = layout.offset(q);
+      if (mesh.cells(psi, b)[o] < STIFF) return;
+      RealVec x{};
+      for (int a = 0; a < DIM; ++a) x[a] = block.lo[a] + (q[a] + 0.5) * block.dx;
+      Sample s{};
+      solid.find_crystal(x, b, o, s);
+      parts[at(b)].resize(crystals.size());
+      double& most = parts[at(b)][s.crystal];
+      most = std::max(most, std::sqrt(dot(s.r, s.r)) + block.dx);
+    });
+  });
+  std::vector<double> most(crystals.size());
+  for (const std::vector<double>& part : parts)
+    for (std::size_t k = 0; k < part.size(); ++k) most[k] = std::max(most[k], part[k]);
+  return amr::global_max(std::move(most), mesh.comm());
+}
+
 void measure_motion(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain, amr::FaceField velocity,
                     std::vector<Seed>& crystals) {
   if (crystals.empty()) return;

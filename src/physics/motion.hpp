@@ -27,4 +27,8 @@ struct Load {
 std::vector<Load> net_loads(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain, const std::vector<Seed>& crystals,
                                 const std::function<const double*(int b, int axis)>& force);
 
+/// Radii about the crystals' centres that hold all that is stiffer than melt; 0 without solid. Collective.
+std::vector<double> extents(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain,
+                            const std::vector<Seed>& crystals);
+
 }  // namespace dendrift::physics

@@ -227,6 +227,23 @@ void StokesSolver::prepare_pressure() {
   pressure_cycle_->prepare({links});
 }
 
+// A cycle finds next to nothing of the error of a solid's spin: on coarse grids its surface is stiff as well. GMRES then
+// stops with the spin as it was guessed, for it is measured by what the preconditioner makes of a residual.
+void StokesSolver::prepare_turning() {
+  if (turning_.empty()) return;
+  for (int axis = 0; axis < TurningModes::AXES; ++axis) {
+    for_leaves([&](int, int g, int i, double) {
+      const Layout& layout = hierarchy_.grid(g).layout;
+      std::fill_n(work_.at(g, i, PRESSURE) - layout.interior(), layout.size(), 0.0);
+    });
+    turning_.write(axis, work_);
+    hierarchy_.make_composite(work_, 1, true);
+    apply(work_, nullptr, image_);
+    turning_.take_image(axis, image_);
+  }
+  turning_.prepare();
+}
+
 void StokesSolver::set_up_pieces() {
   pieces_.first.assign(1, 0);
   pieces_.weight.clear();
@@ -402,10 +419,11 @@ void StokesSolver::cycle_velocity(HierarchyField& r) {
   });
 }
 
-// In place: pressure from the divergence, then velocities from what the pressure leaves of the momentum.
+// In place: rotations of solids, then pressure from the divergence, then velocities from what both leave of the momentum.
 void StokesSolver::precondition(HierarchyField& r) {
   const bool cycle = sigma_ > 0 || drag_ != nullptr;
   const double factor = drag_ != nullptr ? 1.0 : sigma_;  // of -div grad, or it is in the mobility
+  if (!turning_.empty()) turning_.take_from(r);
   if (cycle) cycle_pressure(r);
   for_leaves([&](int, int g, int i, double) {
     const Layout& layout = hierarchy_.grid(g).layout;
@@ -418,6 +436,7 @@ void StokesSolver::precondition(HierarchyField& r) {
   });
   hierarchy_.make_composite(pressure_, 1, true);
   cycle_velocity(r);
+  if (!turning_.empty()) turning_.add_to(r);
   for_leaves([&](int, int g, int i, double) {
     amr::copy_box(r.ref(g, i, PRESSURE), {}, std::as_const(pressure_).ref(g, i, 0), {}, filled(mesh_.layout().n));
   });
@@ -465,6 +484,7 @@ StokesResult StokesSolver::solve(double sigma) {
     finish(x, result);
     return result;
   }
+  prepare_turning();
   return iterate(std::move(x), options_.tolerance, options_.max_iterations);
 }
 

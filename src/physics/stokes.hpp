@@ -13,6 +13,7 @@
 #include "amr/krylov.hpp"
 #include "amr/multigrid.hpp"
 #include "physics/rigid_bodies.hpp"
+#include "physics/turning_modes.hpp"
 
 namespace dendrift::physics {
 
@@ -40,8 +41,9 @@ struct StokesResult {
 
 /// Solver for one mesh; build it anew when the mesh changes. Components of its fields: the velocities, then the pressure.
 ///
-/// GMRES on the whole system. Preconditioner: one multigrid cycle on the viscous operator, all components together, and nu + sigma (-Lap)^-1 for the pressure (Cahouet & Chabard, Int. J. Numer. Methods
-/// Fluids 8, 869 (1988)), the inverse Laplacian being one cycle as well.
+/// GMRES on the whole system. Preconditioner: the rotations of solids first (TurningModes), then one multigrid cycle on the
+/// viscous operator, all components together, and nu + sigma (-Lap)^-1 for the pressure (Cahouet & Chabard, Int. J. Numer.
+/// Methods Fluids 8, 869 (1988)), the inverse Laplacian being one cycle as well.
 class StokesSolver {
  public:
   static constexpr int PRESSURE = DIM;
@@ -62,6 +64,9 @@ class StokesSolver {
   /// motion about its centre that leaves no net force and torque; 0 for those that are held, and without centres.
   void set_drag(const std::function<void(int b, double* phi)>& phase, const std::function<double(double)>& law,
                 const std::vector<RealVec>& centres, const RigidBodies::Owners& owners = {});
+
+  /// Solids whose rotations the preconditioner is to know: they should turn freely. Of the coupled solution only.
+  void set_whirls(const std::vector<Whirl>& whirls) { turning_.build(hierarchy_, components_, whirls); }
 
   StokesResult solve(double sigma);
   /// Goes on from the last solution to a smaller tolerance.
@@ -85,6 +90,7 @@ class StokesSolver {
   void set_up_pieces();
   std::vector<amr::Links> velocity_links(double sigma) const;
   void prepare_pressure();
+  void prepare_turning();
   void apply(const amr::HierarchyField& x, const amr::HierarchyField* rhs, amr::HierarchyField& y);
   void precondition(amr::HierarchyField& r);
   void cycle_pressure(amr::HierarchyField& r);
@@ -118,6 +124,7 @@ class StokesSolver {
   amr::HierarchyField state_, force_, work_, image_, viscosity_, pressure_;
   std::unique_ptr<amr::HierarchyField> drag_, mobility_;  // on faces: kappa and 1/(sigma + kappa)
   RigidBodies bodies_;
+  TurningModes turning_;
   std::unique_ptr<amr::Multigrid> velocity_cycle_, pressure_cycle_;
   amr::Pieces pieces_;
   amr::Gmres gmres_, momentum_, poisson_;
