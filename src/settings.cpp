@@ -173,6 +173,10 @@ Settings::Settings() {
     } catch (const std::invalid_argument&) {  // reported above
     }
     const std::vector<physics::Seed> seeds = physics::make_seeds(all, s);
+    const auto held = std::ranges::count_if(seeds, &physics::Seed::held);
+    if (checks.has_table("flow") && held > 0 && held < std::ssize(seeds) && flow.solid == physics::SolidModel::viscous &&
+        flow.motion == physics::Motion::free)
+      checks.fail("flow.solid", "\"penalised\", where some crystals are held and others free", "\"viscous\"");
     for (std::size_t i = 0; i < seeds.size(); ++i)
       for (int a = 0; a < DIM; ++a) {
         if (seeds[i].position[a] >= 0 && seeds[i].position[a] <= size[a]) continue;
