@@ -74,6 +74,13 @@ std::vector<double> exact_sums(std::span<ExactSum> local, MPI_Comm comm) {
   return values;
 }
 
+std::vector<double> exact_sums(std::span<const std::vector<double>> parts, std::size_t width, MPI_Comm comm) {
+  std::vector<ExactSum> total(width);
+  for (const std::vector<double>& part : parts)
+    for (std::size_t k = 0; k < part.size(); ++k) total[k].add(part[k]);
+  return exact_sums(total, comm);
+}
+
 double global_max(double x, MPI_Comm comm) {
   MPI_Allreduce(MPI_IN_PLACE, &x, 1, MPI_DOUBLE, MPI_MAX, comm);
   return x;

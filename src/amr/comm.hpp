@@ -26,8 +26,10 @@ class ExactSum {
   std::array<std::int64_t, LIMBS + 1> limbs_{};  // the last one counts summands that are not finite
 };
 
-/// Sums over all ranks, exact before the final rounding. Collective. 
+/// Sums over all ranks, exact before the final rounding. Collective.
 std::vector<double> exact_sums(std::span<ExactSum> local, MPI_Comm comm);
+/// The same of `width` numbers a part; a part may be empty. Collective.
+std::vector<double> exact_sums(std::span<const std::vector<double>> parts, std::size_t width, MPI_Comm comm);
 
 double global_max(double x, MPI_Comm comm);
 std::vector<double> global_max(std::vector<double> x, MPI_Comm comm);  ///< of each entry

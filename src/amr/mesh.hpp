@@ -4,6 +4,7 @@
 
 #include <mpi.h>
 
+#include <algorithm>
 #include <memory>
 #include <span>
 #include <vector>
@@ -33,6 +34,12 @@ struct Layout {
   constexpr std::ptrdiff_t interior() const { return offset(filled(GHOSTS)); }
   constexpr std::ptrdiff_t size() const { return stride(DIM); }
 };
+
+/// Whether all cells of an array, ghosts included, hold the same; values: cell (0,0[,0]).
+inline bool uniform(const double* values, const Layout& layout) {
+  const double* p = values - layout.interior();
+  return std::all_of(p, p + layout.size(), [&](double x) { return x == *p; });
+}
 
 /// A leaf owned by this rank.
 struct Block {

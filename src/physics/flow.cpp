@@ -656,21 +656,9 @@ void Flow::balance_crystals(double elapsed) {
     result_ = solver_->improve(wanted, most - before);
     result_.converged = std::isfinite(result_.error);  // it was before
     result_.iterations += before;
-    fastest_ = fastest();
+    fastest_ = result_.fastest;
     unbalanced_ = unbalanced();
   }
-}
-
-double Flow::fastest() const {
-  double most = 0;
-  for (int b = 0; b < mesh_->size(); ++b) {
-    const auto [g, i] = solver_->hierarchy().place_of_block(b);
-    for (int a = 0; a < DIM; ++a)
-      amr::for_each_cell({}, filled(mesh_->layout().n), [&](const IntVec& q) {
-        most = std::max(most, std::abs(solver_->state().at(g, i, a)[mesh_->layout().offset(q)]));
-      });
-  }
-  return amr::global_max(most, mesh_->comm());
 }
 
 void Flow::solve(double elapsed) {
@@ -694,7 +682,7 @@ void Flow::solve(double elapsed) {
   }
   if (options_.coupling == Coupling::coupled) extrapolate(elapsed);  // a projection starts from the old pressure
   result_ = solver_->solve(sigma);
-  fastest_ = fastest();
+  fastest_ = result_.fastest;
   unbalanced_ = unbalanced();
   balance_crystals(elapsed);
   if (!std::isfinite(result_.error))

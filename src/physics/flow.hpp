@@ -138,7 +138,6 @@ class Flow : public Module {
   void set_force(double sigma);
   void add_inertia(int b);
   void balance_crystals(double elapsed);
-  double fastest() const;
   double unbalanced() const;
   Array<bool> unheld() const;
   RealVec means(const amr::HierarchyField& f) const;

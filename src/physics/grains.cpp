@@ -19,12 +19,6 @@ constexpr double TOUCHED = -2.0821;  // psi of phi = -.9, on both sides of a con
 
 std::size_t at(int i) { return static_cast<std::size_t>(i); }
 
-// Whether all cells of an array, ghosts included, hold the same.
-bool uniform(const double* values, const amr::Layout& layout) {
-  const double* p = values - layout.interior();
-  return std::all_of(p, p + layout.size(), [&](double x) { return x == *p; });
-}
-
 }  // namespace
 
 Grains::Grains(const Scales& scales, const PhaseFieldOptions& phase, std::vector<Seed>& crystals)
@@ -148,7 +142,7 @@ void Grains::assign_block(int b) {
     shift[a] = mesh_->cells(shift_[a], b);
     shift_next[a] = mesh_->cells(shift_next_[a], b);
   }
-  if (uniform(grain, layout)) {  // wherever the markers are, they say the same: start afresh
+  if (amr::uniform(grain, layout)) {  // wherever the markers are, they say the same: start afresh
     amr::for_each_row(filled(layout.n), [&](const IntVec& row) {
       const std::ptrdiff_t o = layout.offset(row);
       std::copy_n(grain + o, layout.n, next + o);
@@ -204,7 +198,7 @@ void Grains::find_contacts() {
   std::vector<std::set<Pair>> parts(at(mesh_->size()));
   amr::parallel_for(mesh_->size(), [&](int b) {
     const double *psi = mesh_->cells(psi_, b), *grain = mesh_->cells(grain_, b);
-    if (uniform(grain, layout)) return;
+    if (amr::uniform(grain, layout)) return;
     for (int a = 0; a < DIM; ++a) {
       const std::ptrdiff_t s = layout.stride(a);
       amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
@@ -312,7 +306,7 @@ void Grains::tag(int b, amr::Tag& tag) const {
   const amr::Layout& layout = mesh_->layout();
   const double *psi = mesh_->cells(psi_, b), *grain = mesh_->cells(grain_, b);
   const int finest = mesh_->shape().max_level;
-  if (!uniform(grain, layout))
+  if (!amr::uniform(grain, layout))
     for (int a = 0; a < DIM; ++a) {
       const std::ptrdiff_t s = layout.stride(a);
       amr::for_each_cell(filled(-1), filled(layout.n + 1), [&](const IntVec& cell) {

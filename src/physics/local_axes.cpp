@@ -12,11 +12,6 @@ namespace {
 
 std::size_t at(int i) { return static_cast<std::size_t>(i); }
 
-bool uniform(const double* values, const amr::Layout& layout) {
-  const double* p = values - layout.interior();
-  return std::all_of(p, p + layout.size(), [&](double x) { return x == *p; });
-}
-
 // Row i: crystal axis i, for a given turn in the plane.
 Array<RealVec> axes_of(double angle) {
   Array<RealVec> axes{};
@@ -49,7 +44,7 @@ void LocalAxes::prepare(int b, const std::vector<Seed>& crystals, Own& own) cons
   const auto crystal = [&](std::ptrdiff_t q) -> const Seed& { return crystals[static_cast<std::size_t>(grain[q])]; };
   own.arrays.clear();
   own.disordered = false;
-  if (uniform(alpha != nullptr ? alpha : grain, layout)) {
+  if (amr::uniform(alpha != nullptr ? alpha : grain, layout)) {
     // A crystal whose angle it is gives its axes, which may be those of the mesh exactly.
     own.axes = alpha == nullptr || *alpha == crystal(0).angle ? crystal(0).axes : axes_of(*alpha);
     own.rotated = false;

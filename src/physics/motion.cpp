@@ -70,10 +70,7 @@ class Solid {
         add(part.data() + s.crystal * width, s);
       });
     });
-    std::vector<amr::ExactSum> total(width * crystals_.size());
-    for (const std::vector<double>& part : parts)
-      for (std::size_t k = 0; k < part.size(); ++k) total[k].add(part[k]);
-    return amr::exact_sums(total, mesh_.comm());
+    return amr::exact_sums(parts, width * crystals_.size(), mesh_.comm());
   }
 
   /// Sets the crystal that the cell at x belongs to, and the way from its centre.
@@ -141,10 +138,7 @@ std::vector<Load> net_loads(const amr::Mesh& mesh, amr::CellField psi, amr::Cell
       for (std::size_t a = 0; a < 3; ++a) part[DIM + a] += torque[a];
     });
   });
-  std::vector<amr::ExactSum> total(WIDTH * crystals.size());
-  for (const std::vector<double>& part : parts)
-    for (std::size_t k = 0; k < part.size(); ++k) total[k].add(part[k]);
-  const std::vector<double> sums = amr::exact_sums(total, mesh.comm());
+  const std::vector<double> sums = amr::exact_sums(parts, WIDTH * crystals.size(), mesh.comm());
   std::vector<Load> net(crystals.size());
   for (std::size_t g = 0; g < crystals.size(); ++g) {
     std::copy_n(sums.data() + g * WIDTH, DIM, net[g].force.begin());

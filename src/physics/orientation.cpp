@@ -125,7 +125,7 @@ void Orientation::welcome() {
 // What the field has turned beyond the rigid motion counts as the crystal's turn.
 void Orientation::follow(const std::vector<Seed>& moved) {
   const amr::Layout& layout = mesh_->layout();
-  std::vector<std::vector<std::array<double, 2>>> parts(at(mesh_->size()));  // volume; times what the angle is beyond
+  std::vector<std::vector<double>> parts(at(mesh_->size()));  // of each crystal: volume; times what the angle is beyond
   amr::parallel_for(mesh_->size(), [&](int b) {
     const double *psi = mesh_->cells(psi_, b), *grain = mesh_->cells(grain_, b), *alpha = mesh_->cells(alpha_, b);
     const double cell_volume = std::pow(mesh_->block(b).dx, DIM);
@@ -133,16 +133,12 @@ void Orientation::follow(const std::vector<Seed>& moved) {
       const std::ptrdiff_t q = layout.offset(cell);
       if (psi[q] <= CORE || !free_cell(grain[q])) return;
       const auto g = static_cast<std::size_t>(grain[q]);
-      parts[at(b)].resize(crystals_.size());
-      parts[at(b)][g][0] += cell_volume;
-      parts[at(b)][g][1] += cell_volume * difference(alpha[q], moved[g].angle);
+      parts[at(b)].resize(2 * crystals_.size());
+      parts[at(b)][2 * g] += cell_volume;
+      parts[at(b)][2 * g + 1] += cell_volume * difference(alpha[q], moved[g].angle);
     });
   });
-  std::vector<amr::ExactSum> sums(2 * crystals_.size());
-  for (const auto& part : parts)
-    for (std::size_t g = 0; g < part.size(); ++g)
-      for (std::size_t k = 0; k < 2; ++k) sums[2 * g + k].add(part[g][k]);
-  const std::vector<double> total = amr::exact_sums(sums, mesh_->comm());
+  const std::vector<double> total = amr::exact_sums(parts, 2 * crystals_.size(), mesh_->comm());
   for (std::size_t g = 0; g < crystals_.size(); ++g)
     if (total[2 * g] > 0) crystals_[g].turn(total[2 * g + 1] / total[2 * g]);
 }

@@ -75,10 +75,7 @@ void RigidBodies::build(const amr::Hierarchy& hierarchy, const amr::HierarchyFie
       });
     }
   });
-  std::vector<amr::ExactSum> total(MOMENTS * centres.size());
-  for (const std::vector<double>& part : parts)
-    for (std::size_t k = 0; k < part.size(); ++k) total[k].add(part[k]);
-  const std::vector<double> sums = amr::exact_sums(total, mesh.comm());
+  const std::vector<double> sums = amr::exact_sums(parts, MOMENTS * centres.size(), mesh.comm());
   inverse_.assign(centres.size(), {});
   for (std::size_t n = 0; n < centres.size(); ++n) {
     using Matrix = Eigen::Matrix<double, RIGID, RIGID, Eigen::RowMajor>;
@@ -101,10 +98,7 @@ void RigidBodies::fit(const amr::HierarchyField& v) {
       for (std::size_t u = 0; u < RIGID; ++u) part[at(f.body) * RIGID + u] += load * m[u];
     }
   });
-  std::vector<amr::ExactSum> total(RIGID * motions_.size());
-  for (const std::vector<double>& part : parts)
-    for (std::size_t k = 0; k < part.size(); ++k) total[k].add(part[k]);
-  const std::vector<double> sums = amr::exact_sums(total, mesh.comm());
+  const std::vector<double> sums = amr::exact_sums(parts, RIGID * motions_.size(), mesh.comm());
   for (std::size_t n = 0; n < motions_.size(); ++n)
     for (std::size_t u = 0; u < RIGID; ++u) {
       motions_[n][u] = 0;

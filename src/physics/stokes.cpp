@@ -539,8 +539,8 @@ void StokesSolver::finish(const Vector& x, StokesResult& result) {
     });
   }
   div = amr::global_max(div, mesh_.comm());
-  fastest = amr::global_max(fastest, mesh_.comm());
-  result.divergence_max = fastest > 0 ? div / fastest : div;
+  result.fastest = amr::global_max(fastest, mesh_.comm());
+  result.divergence_max = result.fastest > 0 ? div / result.fastest : div;
 }
 
 }  // namespace dendrift::physics

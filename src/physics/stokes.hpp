@@ -36,7 +36,8 @@ struct StokesResult {
   int iterations = 0;
   bool converged = false;
   double error = 0;           ///< preconditioned residual over the norm of the velocity: of the coupled system, always
-  double divergence_max = 0;  ///< largest |div v| dx over the largest |v|
+  double fastest = 0;         ///< largest component of v on a face
+  double divergence_max = 0;  ///< largest |div v| dx over that
 };
 
 /// Solver for one mesh; build it anew when the mesh changes. Components of its fields: the velocities, then the pressure.

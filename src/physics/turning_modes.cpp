@@ -147,11 +147,7 @@ std::vector<double> TurningModes::sums(std::size_t width, F&& f) const {
     part.resize(width * turns_.size());
     for (const Face& face : faces_[at(b)]) f(part.data() + at(face.whirl) * width, face, g, i);
   });
-  std::vector<amr::ExactSum> total(width * turns_.size());
-  for (const std::vector<double>& part : parts)
-    for (std::size_t k = 0; k < part.size(); ++k)
-      if (part[k] != 0) total[k].add(part[k]);
-  return amr::exact_sums(total, mesh.comm());
+  return amr::exact_sums(parts, width * turns_.size(), mesh.comm());
 }
 
 void TurningModes::prepare() {

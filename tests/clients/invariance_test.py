@@ -39,6 +39,7 @@ levels = 4
 block_cells = 8
 max_regrid_steps = 3
 """
+PERIODIC_3D = "".join(f'{axis}{end} = "periodic"\n' for axis in "xyz" for end in ("lo", "hi"))
 TALL = MESH_2D + """
 size_W0 = [64, 128]
 root_blocks = [1, 2]
@@ -166,13 +167,7 @@ radius_W0 = 6
 euler_deg = [10, 30, 50]
 """),
     # crystals in touch, and one that comes later, carried across periodic sides
-    "3D grains": (dict(lines=0.2, steps=65, omega=0.3), MESH_3D + """
-xlo = "periodic"
-xhi = "periodic"
-ylo = "periodic"
-yhi = "periodic"
-zlo = "periodic"
-zhi = "periodic"
+    "3D grains": (dict(lines=0.2, steps=65, omega=0.3), MESH_3D + PERIODIC_3D + """
 [[seed]]
 position_W0 = [24, 32, 32]
 radius_W0 = 5
@@ -187,13 +182,7 @@ nucleation_time_tau0 = 1
 [flow]
 velocity_W0_tau0 = [3, 1, -2]
 """),
-    "3D drift": (dict(lines=0.2, steps=33, omega=0.2), MESH_3D + """
-xlo = "periodic"
-xhi = "periodic"
-ylo = "periodic"
-yhi = "periodic"
-zlo = "periodic"
-zhi = "periodic"
+    "3D drift": (dict(lines=0.2, steps=33, omega=0.2), MESH_3D + PERIODIC_3D + """
 [[seed]]
 position_W0 = [32, 32, 32]
 radius_W0 = 5
