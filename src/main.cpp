@@ -6,10 +6,12 @@
 
 #include <csignal>
 #include <exception>
+#include <memory>
 
 #include "command_line.hpp"
 #include "io/hdf5.hpp"
 #include "io/manifest.hpp"
+#include "restart.hpp"
 #include "settings.hpp"
 #include "simulation.hpp"
 
@@ -17,7 +19,15 @@ namespace {
 
 using namespace dendrift;
 
-void on_signal(int) { Simulation::request_stop(); }
+void on_signal(int number) {
+  static volatile std::sig_atomic_t interrupted = 0;
+  if (number == SIGINT && interrupted != 0) {  // who asks twice does not want to wait for a checkpoint
+    std::signal(SIGINT, SIG_DFL);
+    std::raise(SIGINT);
+  }
+  if (number == SIGINT) interrupted = 1;
+  Simulation::request_stop();
+}
 
 int run(const CommandLine& command, bool root) {
   // 1. What is asked for
@@ -29,17 +39,17 @@ int run(const CommandLine& command, bool root) {
   settings.parse(command.input, command.overrides);
 
   // 2. The state: a fresh one, or that of a checkpoint
-  std::optional<std::string> checkpoint;
-  if (!command.restart.empty()) checkpoint = io::find_checkpoint(command.restart);
-  Simulation simulation(settings, MPI_COMM_WORLD, checkpoint);
+  const std::unique_ptr<Simulation> simulation =
+      command.restart.empty() ? std::make_unique<Simulation>(settings, MPI_COMM_WORLD)
+                              : restart(settings, MPI_COMM_WORLD, command.restart, command.allow_changes);
   if (command.check) {
-    simulation.print_check();
+    simulation->print_check();
     return 0;
   }
 
   // 3. The run
   for (const int s : {SIGTERM, SIGINT, SIGUSR1}) std::signal(s, on_signal);
-  return simulation.run() == Outcome::stopped ? exit_code::stopped : exit_code::done;
+  return simulation->run() == Outcome::stopped ? exit_code::stopped : exit_code::done;
 }
 
 }  // namespace
