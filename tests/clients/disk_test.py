@@ -107,6 +107,29 @@ def while_running(disk, action, ranks, text):
     return result
 
 
+def without_reserving(folder, disk, checkpoint, content):
+    """Where the file system cannot reserve space, a full disk shows in the middle of HDF5's work."""
+    library = folder / "no_fallocate.so"
+    code = "#include <errno.h>\n" + "".join(f"int {f}(int a, int b, long c, long d) {{ errno = EOPNOTSUPP; return -1; }}\n"
+                                             for f in ("fallocate", "fallocate64"))
+    compiler = shutil.which("cc") or shutil.which("gcc")
+    if not compiler:
+        return say("no C compiler: nothing about file systems that cannot reserve space")
+    subprocess.run([compiler, "-shared", "-fPIC", "-w", "-x", "c", "-o", library, "-"], input=code, text=True, check=True)
+    os.environ["LD_PRELOAD"] = str(library)
+    try:
+        # From no room for HDF5's bookkeeping to nearly enough for the values
+        for ranks, pages in ((0, 5), (0, 7), (2, 6), (2, 8), (2, 9)):
+            fill(disk, pages * PAGE)
+            restarted(disk, "run.max_steps=21", ranks=ranks, texts=("No space left" if pages < 7 else "could not",))
+            (disk / "run/chk_0000020.h5").unlink(missing_ok=True)
+            sound(disk / "run", checkpoint, content)
+            (disk / "filler").unlink()
+    finally:
+        del os.environ["LD_PRELOAD"]
+    say("full, on a file system that cannot reserve space")
+
+
 def main():
     folder = scratch()
     disk = mounted(folder)
@@ -131,6 +154,8 @@ def main():
         require(not (disk / "run/plt_0000012.hdf").exists(), "half a plotfile has its final name")
         (disk / "filler").unlink()
     say("full during a plotfile")
+
+    without_reserving(folder, disk, checkpoint, content)
 
     for ranks in (0, 2):
         result = while_running(disk, lambda: fill_to_the_last(disk), ranks, "No space left")
