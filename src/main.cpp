@@ -5,6 +5,8 @@
 #include <mpi.h>
 
 #include <csignal>
+#include <cstdio>
+#include <cstdlib>
 #include <exception>
 #include <memory>
 
@@ -75,6 +77,11 @@ int main(int argc, char** argv) {
   } catch (const std::exception& e) {
     fail(1, fmt::format("rank {}: {}", rank, e.what()));
     MPI_Abort(MPI_COMM_WORLD, 1);  // one rank alone: the others would wait forever
+  }
+  if (code == exit_code::output_failure) {
+    MPI_Barrier(MPI_COMM_WORLD);  // the message is out before a launcher ends the others
+    std::fflush(nullptr);
+    if (io::hdf5_is_broken()) std::_Exit(code);
   }
   MPI_Finalize();
   return code;

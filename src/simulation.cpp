@@ -28,6 +28,8 @@ volatile std::sig_atomic_t stop_requested = 0;
 
 constexpr double DIAGNOSTICS_TOLERANCE = 1e-9;  // of a time, relative: reached
 
+constexpr const char* GIVEN_UP = ".old";  // follows the name of a checkpoint that is later than a restart
+
 std::size_t at(int i) { return static_cast<std::size_t>(i); }
 
 // The first multiple of an interval that lies after t.
@@ -407,17 +409,13 @@ void Simulation::open_output() {
                    : "time_s,grain,x_um,y_um,z_um,vx_um_s,vy_um_s,vz_um_s,omega_x_rad_s,omega_y_rad_s,omega_z_rad_s,"
                      "q0,q1,q2,q3,volume_um3,nonrigidity,contacts";
       const double now = time_ * settings_.scales.tau0_s;
+      if (resumed_) find_saved();
       remove_leftovers();
       if (resumed_) {
         io::cut_series(path("plt.hdf.series"), now);
         grains_csv_ = std::make_unique<io::CsvFile>(path("grains.csv"), grains, "time_s", now);
-        const std::string own = checkpoint_name();
         diagnostics_csv_ = std::make_unique<io::CsvFile>(path("diagnostics.csv"), diagnostics, "time_s", now);
         tips_csv_ = std::make_unique<io::CsvFile>(path("tips.csv"), tips, "time_s", now);
-        // Checkpoints from before the restart count as well. Later ones belong to a course that is given up.
-        for (const std::string& name : io::list_checkpoints(settings_.output.dir)) saved_.push_back(path(name));
-        const auto later = [&](const std::string& file) { return file.size() > own.size() || file > own; };
-        std::stable_partition(saved_.begin(), saved_.end(), later);
       } else {
         diagnostics_csv_ = std::make_unique<io::CsvFile>(path("diagnostics.csv"), diagnostics);
         tips_csv_ = std::make_unique<io::CsvFile>(path("tips.csv"), tips);
@@ -426,6 +424,25 @@ void Simulation::open_output() {
     });
   failure.agree(comm_);
   write_manifest("running");
+}
+
+// Checkpoints from before the restart count as well. Later ones belong to a course that is given up: the next restart must not
+// take them, so this comes before anything of that course is removed, and they are the first to go.
+void Simulation::find_saved() {
+  const std::string own = checkpoint_name();
+  std::vector<std::string> earlier;
+  for (const std::string& name : io::list_checkpoints(settings_.output.dir)) {
+    const std::string file = path(name);
+    if (file.size() < own.size() || (file.size() == own.size() && file <= own))
+      earlier.push_back(file);
+    else
+      io::complete_file(file, file + GIVEN_UP);
+  }
+  for (const auto& e : std::filesystem::directory_iterator(settings_.output.dir)) {
+    const std::string name = e.path().filename().string();
+    if (name.starts_with("chk_") && name.ends_with(std::string(".h5") + GIVEN_UP)) saved_.push_back(path(name));
+  }
+  saved_.insert(saved_.end(), earlier.begin(), earlier.end());
 }
 
 void Simulation::remove_leftovers() const {
@@ -439,7 +456,7 @@ void Simulation::remove_leftovers() const {
     const bool torn = output && name.ends_with(".part");
     // What an earlier run left here would be mistaken for this one's. A restart goes on with what it had written by then.
     const bool stale = resumed_ ? plotfile(name) && later(name)
-                                : name == "plt.hdf.series" || plotfile(name) || (output && name.ends_with(".h5"));
+                                : name == "plt.hdf.series" || plotfile(name) || (output && (name.ends_with(".h5") || name.ends_with(GIVEN_UP)));
     if (torn || stale) useless.push_back(e.path());
   }
   for (const auto& p : useless) std::filesystem::remove(p);

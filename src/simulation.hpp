@@ -107,6 +107,7 @@ class Simulation {
   Request agreed_request() const;
   Outcome run_to_end();
   void open_output();
+  void find_saved();
   void remove_leftovers() const;
   void write_line(const Totals& t, double dt);
   void write_tips(io::SharedFailure& failure);

@@ -45,6 +45,12 @@ std::string text_of(const Dataset& d) {
   return {bytes.begin(), bytes.end()};
 }
 
+std::size_t bytes_of_state(const RunState& state) {
+  std::size_t bytes = state.input.size() + state.origin.size();
+  for (const auto& [name, values] : state.numbers) bytes += name.size() + values.size() * sizeof(double);
+  return bytes;
+}
+
 std::uint32_t checksum_of(std::span<const double> values) { return crc32(std::as_bytes(values)); }
 
 // Everything but the values of the fields and their checksums; one rank alone.
@@ -58,7 +64,7 @@ void create_file(const std::string& path, const amr::Mesh& mesh, const RunState&
   for (const int id : fields_kept) all_values += length(id);
   // A full disk must show here, where one rank alone can still give up.
   const hsize_t per_leaf = sizeof(std::int32_t) * (DIM + 1 + fields_kept.size());
-  reserve_space(path, (1 << 18) + all_values * sizeof(double) + mesh.owners().size() * per_leaf);
+  reserve_space(path, (1 << 16) + bytes_of_state(state) + all_values * sizeof(double) + mesh.owners().size() * per_leaf);
   file.write_attribute("format", std::int32_t{CHECKPOINT_FORMAT});
   file.write_attribute("dim", std::int32_t{DIM});
   file.write_attribute("block_cells", std::int32_t{mesh.layout().n});

@@ -38,6 +38,21 @@ std::string detail::last_error() {
   return "HDF5: " + reports.back() + ": " + reports.front();
 }
 
+namespace {
+
+bool broken = false;
+
+}  // namespace
+
+bool hdf5_is_broken() noexcept { return broken; }
+
+herr_t Handle::close() {
+  if (id_ < 0) return 0;
+  const herr_t status = closer_(std::exchange(id_, -1));
+  broken = broken || status < 0;
+  return status;
+}
+
 Handle& Handle::operator=(Handle&& other) noexcept {
   if (this != &other) {
     close();

@@ -45,12 +45,16 @@ class Handle {
   ~Handle() { close(); }
   [[nodiscard]] hid_t id() const { return id_; }
   /// Negative on failure; the identifier is given up in any case.
-  herr_t close() { return id_ < 0 ? 0 : closer_(std::exchange(id_, -1)); }
+  herr_t close();
 
  private:
   hid_t id_ = -1;
   Closer closer_ = nullptr;
 };
+
+/// Whether something could not be closed, for want of disk space as a rule. HDF5 1.10 then crashes when it ends, which is part
+/// of MPI_Finalize and of exit().
+[[nodiscard]] bool hdf5_is_broken() noexcept;
 
 /// The numbers that files hold. They are stored as they lie in memory.
 template <class T>

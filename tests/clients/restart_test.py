@@ -89,6 +89,18 @@ def check_seeds_file(folder):
     say("another content of the file of seeds: refused")
 
 
+def check_given_up(folder):
+    """After a restart from an older checkpoint, the later ones are those of another course."""
+    (folder / "scene.toml").write_text(SCENE)
+    run("scene.toml", cwd=folder)
+    run("scene.toml", "run.max_steps=15", "--restart", "run/chk_0000010.h5", cwd=folder)
+    require(sorted(p.name for p in (folder / "run").glob("chk_*")) == ["chk_0000010.h5", "chk_0000020.h5.old"], "checkpoints set aside")
+    result = run("scene.toml", "--restart", "run", cwd=folder)
+    require("restart from run/chk_0000010.h5" in result.out, f"the later checkpoint of another course: {result}")
+    require(sorted(p.name for p in (folder / "run").glob("chk_*")) == ["chk_0000010.h5", "chk_0000020.h5"], "checkpoints at the end")
+    say("a restart from an older checkpoint gives up the later ones")
+
+
 def check_wall_clock(folder):
     (folder / "scene.toml").write_text(SCENE.replace("checkpoint_every_steps = 10", "checkpoint_every_wall_s = 0.1"))
     for ranks in (0, 2):
@@ -126,8 +138,7 @@ def interrupted(folder, times):
 def check_interrupt(folder):
     (folder / "scene.toml").write_text(SCENE)
     require(interrupted(folder, 1) == 75, "SIGINT: exit code 75 expected")
-    run("scene.toml", "run.max_steps=1000000", "run.wall_clock_limit_s=.1", "--restart", "run", "--check", "phase_field.max_dt_tau0=0.001",
-        cwd=folder)
+    run("scene.toml", "run.max_steps=1000000", "--restart", "run", "--check", "phase_field.max_dt_tau0=0.001", cwd=folder)
     codes = [interrupted(folder, 2) for _ in range(3)]  # the first may have been fast enough
     require(-signal.SIGINT in codes and set(codes) <= {-signal.SIGINT, 75}, f"SIGINT twice: exit codes {codes}")
     run("scene.toml", "run.max_steps=1000000", "--restart", "run", "--check", "phase_field.max_dt_tau0=0.001", cwd=folder)
@@ -136,5 +147,6 @@ def check_interrupt(folder):
 
 check_changes(scratch())
 check_seeds_file(scratch())
+check_given_up(scratch())
 check_wall_clock(scratch())
 check_interrupt(scratch())
