@@ -135,6 +135,7 @@ Settings::Settings() {
   flow.declare(schema);
   parallel.declare(schema);
   output.declare(schema);
+  guard.declare(schema);
   schema.check([this](io::Checks& checks) {
     if (mesh.dim != DIM) {
       checks.fail("mesh.dim", std::to_string(DIM) + " in this program (the launcher `dendrift` picks the right one)");

@@ -8,6 +8,7 @@
 
 #include "amr/mesh.hpp"
 #include "amr/partition.hpp"
+#include "guard.hpp"
 #include "io/config.hpp"
 #include "physics/flow.hpp"
 #include "physics/orientation.hpp"
@@ -76,6 +77,7 @@ class Settings {
   MeshOptions mesh;
   ParallelOptions parallel;
   OutputOptions output;
+  GuardOptions guard;
   physics::AlloyOptions alloy;
   physics::PhaseFieldOptions phase_field;
   physics::SoluteOptions solute;

@@ -57,7 +57,7 @@ class Compensated {
 void Simulation::request_stop() { stop_requested = 1; }
 
 Simulation::Simulation(Settings& settings, MPI_Comm comm, const std::optional<std::string>& checkpoint, bool allow_changes)
-    : settings_(settings), comm_(comm), crystals_(settings.crystals) {
+    : settings_(settings), comm_(comm), crystals_(settings.crystals), caution_(settings.guard.max_retries) {
   wall_start_ = last_save_ = MPI_Wtime();
   started_ = io::time_stamp();
   modules_ = physics::make_modules(settings, crystals_);
@@ -105,11 +105,6 @@ void Simulation::require_memory(std::int64_t blocks, const amr::FieldTable& fiel
 
 void Simulation::resume(const std::string& file, bool allow_changes) {
   const io::RunState s = io::read_state(file, comm_);
-  const auto list = [&](const char* name) -> const std::vector<double>& {
-    const auto found = s.numbers.find(name);
-    if (found == s.numbers.end()) throw io::OutputError(file, "restart", std::string("it does not hold ") + name);
-    return found->second;
-  };
   require_same_scene(settings_, file, s, allow_changes);
   require_later_end(file, s);
   if (const auto missing = io::missing_fields(file, *mesh_); !missing.empty())
@@ -128,8 +123,22 @@ void Simulation::resume(const std::string& file, bool allow_changes) {
   const std::vector<int> fresh(at(tree.size()), -1);
   mesh_->install(std::move(tree), std::move(owners), fresh);
   io::read_fields(file, *mesh_);
+  recall(file, s);
+  first_step_ = step_;
+  resumed_ = true;
+  starting_ = false;
+  for (const auto& m : modules_) m->after_regrid();
+  if (mesh_->rank() == 0) fmt::print("{}", restart_log(settings_, file, s, origin()));
+}
+
+void Simulation::recall(const std::string& file, const io::RunState& s) {
+  const auto list = [&](const char* name) -> const std::vector<double>& {
+    const auto found = s.numbers.find(name);
+    if (found == s.numbers.end()) throw io::OutputError(file, "restart", std::string("it does not hold ") + name);
+    return found->second;
+  };
   time_ = s.time;
-  step_ = first_step_ = s.step;
+  step_ = s.step;
   const auto take = [&](const char* name) { return list(name).at(0); };
   next_regrid_ = static_cast<std::int64_t>(take("next_regrid"));
   // Counted anew, because a restart may have other intervals.
@@ -146,10 +155,6 @@ void Simulation::resume(const std::string& file, bool allow_changes) {
   for (const auto& m : modules_)
     if (const auto memory = s.numbers.find(std::string("module.") + m->name()); memory != s.numbers.end())
       m->recall(memory->second);
-  resumed_ = true;
-  starting_ = false;
-  for (const auto& m : modules_) m->after_regrid();
-  if (mesh_->rank() == 0) fmt::print("{}", restart_log(settings_, file, s, origin()));
 }
 
 std::string Simulation::origin() const {
@@ -239,13 +244,24 @@ double Simulation::next_stop() const {
 Outcome Simulation::run() {
   try {
     open_output();
-    return run_to_end();
+    while (true) {
+      try {
+        if (const auto outcome = iterate()) return *outcome;
+      } catch (const NumericalError&) {
+        go_back();
+      }
+    }
   } catch (const NumericalError& e) {
     std::string message = e.what();
     try {
       write_checkpoint(path(fmt::format("failed_{:07d}.h5", step_)));  // beside the good ones, not among them
     } catch (const io::OutputError& not_saved) {
       message += fmt::format("; the state is lost: {}", not_saved.what());
+    }
+    if (!snapshot_.empty()) {
+      restore();
+      save();
+      message += fmt::format("\nthe last good state, of step {}, is in {}", step_, checkpoint_name());
     }
     record_failure(exit_code::numerical_failure, message);
     throw NumericalError(message);
@@ -255,55 +271,98 @@ Outcome Simulation::run() {
   }
 }
 
-Outcome Simulation::run_to_end() {
+std::optional<Outcome> Simulation::iterate() {
   const auto reached = [&](double t) { return time_ >= t * (1 - DIAGNOSTICS_TOLERANCE); };
   const auto due = [&](std::int64_t count, double interval) {
     return interval > 0 && reached(static_cast<double>(count) * interval);
   };
   const double checkpoint_interval = settings_.output.checkpoint_every_s / settings_.scales.tau0_s;
-  double dt = 0;
-  while (true) {
-    const bool end = reached(settings_.end_time) || step_ >= settings_.run.max_steps;
-    if (due(lines_, settings_.diagnostics_interval) || end) {
-      clock_.time("diagnostics", [&] {
-        const Totals t = totals();
-        check_finite(t);
-        if (step_ != last_line_step_) {
-          io::SharedFailure failure;  // one rank writes; all must learn that it could not
-          failure.attempt(path("diagnostics.csv"), "write a line", [&] { write_line(t, dt); });
-          write_tips(failure);
-          write_grains(failure);
-          failure.agree(comm_);
-          last_line_step_ = step_;
-        }
-        lines_ = next_multiple(time_, settings_.diagnostics_interval);
-        progress(t, dt, end);
-      });
-    }
-    if (due(plots_, settings_.plot_interval) || (plots_ == 0) || end) {
-      clock_.time("plotfile", [&] { write_plotfile(); });
-      plots_ = next_multiple(time_, settings_.plot_interval);
-    }
-    if (end) break;
-    const bool steps_due = settings_.output.checkpoint_every_steps > 0 && step_ > first_step_ &&
-                           step_ % settings_.output.checkpoint_every_steps == 0;
-    const Request request = agreed_request();
-    if (due(checkpoints_ + 1, checkpoint_interval) || steps_due || request != Request::none) {
-      checkpoints_ = next_multiple(time_, checkpoint_interval) - 1;
-      clock_.time("checkpoint", [&] { save(); });
-    }
-    if (request == Request::stop) {
-      write_manifest("stopped", exit_code::stopped);
-      return Outcome::stopped;
-    }
-    const double stop = next_stop();
-    const double pieces = std::max(1.0, std::ceil((stop - time_) / max_dt() - 1e-9));
-    dt = (stop - time_) / pieces;
-    step(dt);
-    if (pieces == 1) time_ = stop;
+  const bool end = reached(settings_.end_time) || step_ >= settings_.run.max_steps;
+  if (due(lines_, settings_.diagnostics_interval) || end) {
+    clock_.time("diagnostics", [&] {
+      const Totals t = totals();
+      check_totals(t);
+      if (step_ != last_line_step_) {
+        io::SharedFailure failure;  // one rank writes; all must learn that it could not
+        failure.attempt(path("diagnostics.csv"), "write a line", [&] { write_line(t, dt_); });
+        write_tips(failure);
+        write_grains(failure);
+        failure.agree(comm_);
+        last_line_step_ = step_;
+        written_ = true;
+      }
+      lines_ = next_multiple(time_, settings_.diagnostics_interval);
+      progress(t, dt_, end);
+    });
   }
-  write_manifest("done", exit_code::done);
-  return Outcome::done;
+  if (due(plots_, settings_.plot_interval) || (plots_ == 0) || end) {
+    clock_.time("plotfile", [&] { write_plotfile(); });
+    plots_ = next_multiple(time_, settings_.plot_interval);
+    written_ = true;
+  }
+  if (end) {
+    write_manifest("done", exit_code::done);
+    return Outcome::done;
+  }
+  const bool steps_due = settings_.output.checkpoint_every_steps > 0 && step_ > first_step_ &&
+                         step_ % settings_.output.checkpoint_every_steps == 0;
+  const Request request = agreed_request();
+  if (due(checkpoints_ + 1, checkpoint_interval) || steps_due || request != Request::none) {
+    checkpoints_ = next_multiple(time_, checkpoint_interval) - 1;
+    clock_.time("checkpoint", [&] { save(); });
+    written_ = true;
+  }
+  if (request == Request::stop) {
+    write_manifest("stopped", exit_code::stopped);
+    return Outcome::stopped;
+  }
+  clock_.time("guard", [&] { keep_snapshot(); });
+  const double most = caution_.factor() * max_dt();
+  if (!(most > settings_.guard.min_dt_tau0))
+    throw NumericalError(fmt::format("the time step has collapsed to {:.3g} tau0 at step {}, t = {:.6g} tau0", most, step_, time_));
+  const double stop = next_stop();
+  const double pieces = std::max(1.0, std::ceil((stop - time_) / most - 1e-9));
+  dt_ = (stop - time_) / pieces;
+  if (before_step_) dt_ = before_step_(dt_);
+  step(dt_);
+  if (pieces == 1) time_ = stop;
+  clock_.time("guard", [&] { check_state(); });
+  caution_.settle(time_, step_);
+  return std::nullopt;
+}
+
+// Never older than what has been written, so that nothing is written twice.
+void Simulation::keep_snapshot() {
+  const int every = settings_.guard.snapshot_every_steps;
+  if (every == 0 || (!snapshot_.empty() && !written_ && step_ < snapshot_.state().step + every)) return;
+  snapshot_.take(*mesh_, state());
+  written_ = false;
+}
+
+void Simulation::check_state() const {
+  if (const auto fault = find_fault(*mesh_, psi_, c_, settings_.guard.max_c))
+    throw NumericalError(fmt::format("step {}, t = {:.6g} tau0: {}", step_, time_, *fault));
+}
+
+void Simulation::go_back() {
+  try {
+    throw;
+  } catch (const NumericalError& e) {
+    if (snapshot_.empty() || !caution_.may_retry(time_, step_)) throw;
+    const std::int64_t failed = step_;
+    restore();
+    for (const auto& m : modules_) m->be_careful();
+    if (mesh_->rank() == 0)
+      fmt::print("step {} failed: {}\nback to step {}, with steps of at most {:.3g} of what is stable (try {} of {})\n", failed, e.what(),
+                 step_, caution_.factor(), caution_.tries(), settings_.guard.max_retries);
+  }
+}
+
+void Simulation::restore() {
+  snapshot_.restore(*mesh_);
+  crystals_ = settings_.crystals;  // in place: modules refer to them
+  recall("memory", snapshot_.state());
+  for (const auto& m : modules_) m->after_regrid();
 }
 
 Simulation::Request Simulation::agreed_request() const {
@@ -385,10 +444,15 @@ std::vector<physics::Tip> Simulation::tips() {
   return physics::find_tips(*mesh_, psi_, crystals_);
 }
 
-void Simulation::check_finite(const Totals& t) const {
+void Simulation::check_totals(const Totals& t) const {
   if (!std::isfinite(t.solute_mean))
-    throw NumericalError(fmt::format("phi or c is not finite at step {}, t = {:.6g} tau0; a smaller "
-                                     "phase_field.max_dt_tau0 may help", step_, time_));
+    throw NumericalError(fmt::format("phi or c is not finite at step {}, t = {:.6g} tau0", step_, time_));
+  const auto& sides = settings_.shape.sides;
+  const bool open = std::ranges::find(sides, amr::Side::open) != sides.end() ||
+                    (settings_.has_flow() && settings_.flow.through_walls(settings_.shape));
+  if (!open && std::abs(solute_drift(t)) > settings_.guard.max_solute_drift)
+    throw NumericalError(fmt::format("solute is not conserved at step {}, t = {:.6g} tau0: it has changed by {:.3g} of what there was",
+                                     step_, time_, solute_drift(t)));
 }
 
 void Simulation::open_output() {

@@ -2,6 +2,7 @@
 /// A run: state, one time step, and what is written when.
 #pragma once
 
+#include <functional>
 #include <map>
 #include <memory>
 #include <optional>
@@ -16,7 +17,9 @@
 #include "io/manifest.hpp"
 #include "physics/crystals.hpp"
 #include "physics/module.hpp"
+#include "guard.hpp"
 #include "settings.hpp"
+#include "snapshot.hpp"
 
 namespace dendrift {
 
@@ -90,22 +93,32 @@ class Simulation {
   double max_dt() const;
   void write_checkpoint(const std::string& path);
   const PhaseClock& clock() const { return clock_; }
+  const Caution& caution() const { return caution_; }
+  /// f(dt) is called before each step of run() and returns the step that is taken in its place.
+  void before_step(std::function<double(double)> f) { before_step_ = std::move(f); }
 
  private:
   void build_initial_mesh();
   void require_memory(std::int64_t blocks, const amr::FieldTable& fields) const;
   void resume(const std::string& path, bool allow_changes);
+  void recall(const std::string& file, const io::RunState& s);
   std::string origin() const;
   void require_later_end(const std::string& file, const io::RunState& s) const;
   bool adapt(double max_imbalance);
   void schedule_regrid();
   double next_stop() const;
-  void check_finite(const Totals& t) const;
+  void check_totals(const Totals& t) const;
+  void check_state() const;
+  void keep_snapshot();
+  /// Goes back to the state kept last and halves the step, in a handler of a NumericalError that it throws on if that was
+  /// tried often enough. Collective.
+  void go_back();
+  void restore();
 
   enum class Request : std::uint8_t { none, checkpoint, stop };
   /// What signals and the wall clock ask for, the same on all ranks. Collective.
   Request agreed_request() const;
-  Outcome run_to_end();
+  std::optional<Outcome> iterate();  ///< what is due, and a step; a value at the end
   void open_output();
   void find_saved();
   void remove_leftovers() const;
@@ -141,6 +154,11 @@ class Simulation {
   std::unique_ptr<io::CsvFile> diagnostics_csv_, tips_csv_, grains_csv_;
   std::vector<std::string> saved_;  // rank 0: checkpoints in the folder, the next to be removed first
   PhaseClock clock_;
+  Snapshot snapshot_;
+  Caution caution_;
+  std::function<double(double)> before_step_;
+  bool written_ = false;  // output since the snapshot
+  double dt_ = 0;
   double wall_start_ = 0, last_save_ = 0, last_progress_ = 0;
   std::string started_;
 };

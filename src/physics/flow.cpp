@@ -367,6 +367,12 @@ void Flow::recall(const std::vector<double>& m) {
   recalled_ = true;
 }
 
+void Flow::be_careful() {
+  constexpr double SMALLER = 1e-3;
+  interval_ *= SMALLER;
+  due_ = true;
+}
+
 // f(grid, node, component, values, rates): for the arrays of velocity and pressure of every block, from their first ghost on.
 template <class F>
 void Flow::for_arrays(F&& f) {

@@ -117,6 +117,7 @@ class Flow : public Module {
   void report(Report& r) const override;
   std::vector<double> memory() const override;
   void recall(const std::vector<double>& m) override;
+  void be_careful() override;
 
  private:
   void solve(double elapsed);

@@ -57,6 +57,8 @@ class Module {
   /// What a restart must know beside the fields, and giving it back.
   virtual std::vector<double> memory() const { return {}; }
   virtual void recall(const std::vector<double>&) {}
+  /// The steps after the recalled state led to a failure: intervals of its own begin small.
+  virtual void be_careful() {}
 };
 
 using Modules = std::vector<std::unique_ptr<Module>>;

@@ -1,5 +1,7 @@
 #include "physics/solidification.hpp"
 
+#include <fmt/format.h>
+
 #include <omp.h>
 
 #include <algorithm>
@@ -164,6 +166,8 @@ void Solidification::advance(double, double dt, std::int64_t step) {
     draw(moved);
   }
   if (phase_.frozen) return;
+  if (dt > largest_step(MAX_STAGES) * (1 + 1e-6))  // a fault elsewhere; the result would be wrong by percents before it is not finite
+    throw NumericalError(fmt::format("a step of {:.4g} tau0, where {:.4g} tau0 is stable", dt, largest_step(MAX_STAGES)));
   turn_axes();
   local_axes_.update(crystals_);
   const double dx = mesh_->shape().dx(mesh_->shape().max_level);
