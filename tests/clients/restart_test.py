@@ -32,7 +32,8 @@ checkpoint_every_steps = 10
 PHYSICS = [("alloy.supersaturation", "0.2", "0.3"), ("phase_field.max_dt_tau0", "0.24", "0.2"),
            ("seed[0].angle_deg", "0.0", "30.0"), ("seed[0].radius_W0", "8.0", "8.5"), ("mesh.levels", "3", "2"),
            ("mesh.max_regrid_steps", "50", "10"), ("flow", "absent", "present")]
-BLOCKS = [("mesh.block_cells", "8", "16"), ("mesh.root_blocks", "[2, 1]", "[4, 2]"), ("mesh.size_W0", "[64.0, 32.0]", "[128.0, 64.0]")]
+BLOCKS = [("mesh.block_cells", "8", "16"), ("mesh.root_blocks", "[2, 1]", "[4, 2]"),
+          ("mesh.size_W0", "[64.0, 32.0]", "[128.0, 64.0]")]
 FREE = [("run.title", '""', '"longer"'), ("run.end_time_tau0", "100.0", "200.0"), ("run.max_steps", "21", "25"),
         ("run.wall_clock_limit_s", "0.0", "1000.0"), ("output.checkpoint_every_steps", "10", "3"),
         ("output.plot_every_tau0", "unset", "2.0"), ("parallel.partitioner", '"curve"', '"graph"')]
@@ -89,15 +90,19 @@ def check_seeds_file(folder):
     say("another content of the file of seeds: refused")
 
 
+def checkpoints(folder):
+    return sorted(p.name for p in (folder / "run").glob("chk_*"))
+
+
 def check_given_up(folder):
     """After a restart from an older checkpoint, the later ones are those of another course."""
     (folder / "scene.toml").write_text(SCENE)
     run("scene.toml", cwd=folder)
     run("scene.toml", "run.max_steps=15", "--restart", "run/chk_0000010.h5", cwd=folder)
-    require(sorted(p.name for p in (folder / "run").glob("chk_*")) == ["chk_0000010.h5", "chk_0000020.h5.old"], "checkpoints set aside")
+    require(checkpoints(folder) == ["chk_0000010.h5", "chk_0000020.h5.old"], f"set aside: {checkpoints(folder)}")
     result = run("scene.toml", "--restart", "run", cwd=folder)
     require("restart from run/chk_0000010.h5" in result.out, f"the later checkpoint of another course: {result}")
-    require(sorted(p.name for p in (folder / "run").glob("chk_*")) == ["chk_0000010.h5", "chk_0000020.h5"], "checkpoints at the end")
+    require(checkpoints(folder) == ["chk_0000010.h5", "chk_0000020.h5"], f"at the end: {checkpoints(folder)}")
     say("a restart from an older checkpoint gives up the later ones")
 
 
