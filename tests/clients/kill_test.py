@@ -177,7 +177,7 @@ def main():
         restarts, fresh = restarts + restart, fresh + (not restart)
         now = Run(folder, restart)
         done = None
-        if sum(counts.values()) < kills and moment(now, chance, 0.5 * manifest["wall_s"]):
+        if sum(counts.values()) < kills and moment(now, chance, min(0.5 * manifest["wall_s"], 1.5)):
             done = kill(now, chance)
         text = now.wait(launcher_may_hang=done is not None and done[0] == START)
         hung += now.launcher_hung

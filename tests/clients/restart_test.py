@@ -1,5 +1,6 @@
 #!/usr/bin/python3
 """What a restart may change and what not, checkpoints by the wall clock, and stopping by SIGINT."""
+import json
 import shutil
 import signal
 import subprocess
@@ -8,7 +9,7 @@ import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "lib"))
-from support import command_line, environment, require, run, say, scratch, snapshot
+from support import column, command_line, environment, require, run, say, scratch, snapshot
 
 SCENE = """
 [run]
@@ -98,6 +99,15 @@ def check_given_up(folder):
     """After a restart from an older checkpoint, the later ones are those of another course."""
     (folder / "scene.toml").write_text(SCENE)
     run("scene.toml", cwd=folder)
+    shutil.copytree(folder / "run", folder / "copy")
+    # Stopped before it writes anything new, a restart has already dropped what was later.
+    run("scene.toml", "run.wall_clock_limit_s=1e-6", "--restart", "run/chk_0000010.h5", code=75, cwd=folder)
+    listed = [e["name"] for e in json.loads((folder / "run/plt.hdf.series").read_text())["files"]]
+    plotfiles = sorted(p.name for p in (folder / "run").glob("plt_*"))
+    require(listed == plotfiles == ["plt_0000000.hdf"], f"plotfiles later than the checkpoint: {listed}, {plotfiles}")
+    require(max(column(folder / "run/diagnostics.csv", "step", int)) <= 10, "lines later than the checkpoint")
+    shutil.rmtree(folder / "run")
+    (folder / "copy").rename(folder / "run")
     run("scene.toml", "run.max_steps=15", "--restart", "run/chk_0000010.h5", cwd=folder)
     require(checkpoints(folder) == ["chk_0000010.h5", "chk_0000020.h5.old"], f"set aside: {checkpoints(folder)}")
     result = run("scene.toml", "--restart", "run", cwd=folder)
