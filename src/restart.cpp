@@ -22,7 +22,8 @@ std::optional<std::vector<double>> number(const io::RunState& state, const std::
 
 // How long, what is written and who computes it do not change the course.
 bool free_to_change(const std::string& key) {
-  constexpr const char* RUN[] = {"run.title", "run.end_time_s", "run.end_time_tau0", "run.max_steps", "run.wall_clock_limit_s"};
+  constexpr const char* RUN[] = {"run.title", "run.end_time_s", "run.end_time_tau0", "run.max_steps",
+                                 "run.wall_clock_limit_s"};
   return key.starts_with("output.") || key.starts_with("parallel.") || std::ranges::find(RUN, key) != std::end(RUN);
 }
 
@@ -80,12 +81,15 @@ void require_same_scene(const Settings& settings, const std::string& file, const
   if (!allow_changes) refuse_changes(settings, file, state);
   require_same_blocks(settings, file, state);
   if (!allow_changes && number(state, "shape") != shape_numbers(settings))
-    throw io::OutputError(file, "restart", "this version derives other numbers (W0, tau0, levels) from the same input than the "
-                                           "one that wrote it; --allow-changes continues with the new ones");
+    throw io::OutputError(file, "restart",
+                          "this version derives other numbers (W0, tau0, levels) from the same input than the one that "
+                          "wrote it; --allow-changes continues with the new ones");
 }
 
-std::string restart_log(const Settings& settings, const std::string& file, const io::RunState& state, const std::string& origin) {
-  std::string log = fmt::format("restart from {}: step {}, t = {:.6g} s\n", file, state.step, state.time * settings.scales.tau0_s);
+std::string restart_log(const Settings& settings, const std::string& file, const io::RunState& state,
+                        const std::string& origin) {
+  std::string log = fmt::format("restart from {}: step {}, t = {:.6g} s\n", file, state.step,
+                                state.time * settings.scales.tau0_s);
   if (state.format == 1) log += "restart: the checkpoint is of an older version and has no checksums\n";
   if (state.origin != origin && !state.origin.empty()) log += fmt::format("restart: {}\nbefore:  {}\n", origin, state.origin);
   for (const io::InputChange& c : changes(settings, state))

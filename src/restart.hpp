@@ -28,6 +28,7 @@ std::vector<double> shape_numbers(const Settings& settings);
 void require_same_scene(const Settings& settings, const std::string& file, const io::RunState& state, bool allow_changes);
 
 /// What the restart continues from and what it changes, for the log; `origin`: that of this run.
-std::string restart_log(const Settings& settings, const std::string& file, const io::RunState& state, const std::string& origin);
+std::string restart_log(const Settings& settings, const std::string& file, const io::RunState& state,
+                        const std::string& origin);
 
 }  // namespace dendrift

@@ -110,7 +110,10 @@ void OutputOptions::declare(io::Schema& schema) {
   t.real("diagnostics_every_tau0", diagnostics_every_tau0).unit("tau0").above(0).doc("the same in units of tau0");
   t.real("checkpoint_every_s", checkpoint_every_s).unit("s").at_least(0).doc("simulated time between checkpoints; 0: none but at the end of a stopped run");
   t.integer("checkpoint_every_steps", checkpoint_every_steps).at_least(0).doc("time steps between checkpoints; 0: none");
-  t.real("checkpoint_every_wall_s", checkpoint_every_wall_s).unit("s").at_least(0).doc("running time between checkpoints; 0: none");
+  t.real("checkpoint_every_wall_s", checkpoint_every_wall_s)
+      .unit("s")
+      .at_least(0)
+      .doc("running time between checkpoints; 0: none");
   t.integer("keep_checkpoints", keep_checkpoints).at_least(1).doc("checkpoints kept; older ones are removed");
   schema.check({"output"}, [this](io::Checks& c) {
     override_twin(c, "output.plot_every_s", plot_every_s, "output.plot_every_tau0", plot_every_tau0);

@@ -108,7 +108,8 @@ void Simulation::resume(const std::string& file, bool allow_changes) {
   require_same_scene(settings_, file, s, allow_changes);
   require_later_end(file, s);
   if (const auto missing = io::missing_fields(file, *mesh_); !missing.empty())
-    throw io::OutputError(file, "restart", fmt::format("it does not hold what the input asks for: field {}", fmt::join(missing, ", ")));
+    throw io::OutputError(file, "restart",
+                          fmt::format("it does not hold what the input asks for: field {}", fmt::join(missing, ", ")));
   amr::Tree tree = mesh_->tree();
   try {
     tree = amr::Tree(settings_.shape.root_blocks, settings_.shape.periodic(), settings_.shape.max_level,
@@ -519,8 +520,8 @@ void Simulation::remove_leftovers() const {
     const bool output = name.starts_with("plt_") || name.starts_with("chk_");
     const bool torn = output && name.ends_with(".part");
     // What an earlier run left here would be mistaken for this one's. A restart goes on with what it had written by then.
-    const bool stale = resumed_ ? plotfile(name) && later(name)
-                                : name == "plt.hdf.series" || plotfile(name) || (output && (name.ends_with(".h5") || name.ends_with(GIVEN_UP)));
+    const bool checkpoint = output && (name.ends_with(".h5") || name.ends_with(GIVEN_UP));
+    const bool stale = resumed_ ? plotfile(name) && later(name) : name == "plt.hdf.series" || plotfile(name) || checkpoint;
     if (torn || stale) useless.push_back(e.path());
   }
   for (const auto& p : useless) std::filesystem::remove(p);

@@ -229,7 +229,8 @@ RunState read_state(const std::string& path, MPI_Comm comm) {
     const int count = H5Aget_num_attrs(numbers.id());
     for (int i = 0; i < count; ++i) {
       char name[256] = {};
-      H5Aget_name_by_idx(numbers.id(), ".", H5_INDEX_NAME, H5_ITER_INC, static_cast<hsize_t>(i), name, sizeof name, H5P_DEFAULT);
+      H5Aget_name_by_idx(numbers.id(), ".", H5_INDEX_NAME, H5_ITER_INC, static_cast<hsize_t>(i), name, sizeof name,
+                         H5P_DEFAULT);
       s.numbers[name] = numbers.read_attribute_list<double>(name);
     }
   });
@@ -279,7 +280,7 @@ void read_field(const Dataset& d, amr::Mesh& mesh, int id, std::span<const std::
     d.read(std::span(values), where, Transfer::independent);
     if (!sums.empty() && checksum_of(values) != sums[leaf])
       throw OutputError(d.path(), "restart",
-                        fmt::format("the file is damaged: field {} has another checksum in leaf {} of {} than it was written with",
+                        fmt::format("the file is damaged: field {} has another checksum in leaf {} of {} than when written",
                                     mesh.fields().row(id).name, leaf, leaves));
     amr::copy_box(amr::array_ref(mesh.array(id, b.slot), mesh.layout()), {},
                   amr::packed_ref(static_cast<const double*>(values.data()), n), {}, n);

@@ -146,7 +146,7 @@ std::optional<int> check_seal(const std::string& path, int newest) {
     file.fail(fmt::format("the file is {}: it has {} bytes, not {}", file.size() < seal->bytes ? "truncated" : "damaged",
                           file.size(), seal->bytes));
   if (file.checksum(*seal) != seal->checksum)
-    file.fail("the file is damaged: what stands in it beside the values of fields has another checksum than it was written with");
+    file.fail("the file is damaged: what it holds beside the values of fields has another checksum than when written");
   return seal->format;
 }
 

@@ -410,7 +410,7 @@ def check_bad_restarts(folder):
     changed("bad_leaf.h5", lambda f: f["leaves"].__setitem__(0, 9))
     # What each message must say beside the name of the file
     cases = {"missing.h5": "no such file", "missing/folder": "no such file", "run2/plt_0000000.hdf": "not a checkpoint",
-             "run2/manifest.json": "open", "garbage.h5": "open", "empty.h5": "open", "cut.h5": "truncated",
+             "run2/manifest.json": "open", "garbage.h5": "open", "empty.h5": "empty", "cut.h5": "truncated",
              "nothing_in_it": "no checkpoint", "no_fields.h5": "fields",
              "no_leaves.h5": "not a checkpoint", "later_format.h5": "99", "no_next_regrid.h5": "", "bad_leaf.h5": ""}
     (folder / "out").mkdir()

@@ -149,7 +149,8 @@ def main():
 
     for ranks in (0, 2):
         fill(disk, plotfile // 2)
-        restarted(disk, "run.max_steps=12", "output.checkpoint_every_steps=0", ranks=ranks, texts=("plt_0000012.hdf", "No space left"))
+        restarted(disk, "run.max_steps=12", "output.checkpoint_every_steps=0", ranks=ranks,
+                  texts=("plt_0000012.hdf", "No space left"))
         sound(disk / "run", checkpoint, content)
         require(not (disk / "run/plt_0000012.hdf").exists(), "half a plotfile has its final name")
         (disk / "filler").unlink()
@@ -169,8 +170,8 @@ def main():
         require("disk/run/" in result.err, f"the file is not named: {result}")
         sound(disk / "moved", checkpoint.parent.parent / "moved" / checkpoint.name, content)
         (disk / "moved").rename(disk / "run")
-    result = while_running(disk, lambda: (shutil.copytree(disk / "run", disk / "saved"), shutil.rmtree(disk / "run")), 0, "No such file")
-    shutil.rmtree(disk / "run", ignore_errors=True)
+    shutil.copytree(disk / "run", disk / "saved")
+    while_running(disk, lambda: shutil.rmtree(disk / "run"), 0, "No such file")
     (disk / "saved").rename(disk / "run")
     say("a folder that vanishes")
 

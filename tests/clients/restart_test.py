@@ -1,5 +1,6 @@
 #!/usr/bin/python3
 """What a restart may change and what not, checkpoints by the wall clock, and stopping by SIGINT."""
+import json
 import shutil
 import signal
 import subprocess
@@ -8,7 +9,7 @@ import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "lib"))
-from support import command_line, environment, require, run, say, scratch, snapshot
+from support import column, command_line, environment, require, run, say, scratch, snapshot
 
 SCENE = """
 [run]
@@ -32,7 +33,8 @@ checkpoint_every_steps = 10
 PHYSICS = [("alloy.supersaturation", "0.2", "0.3"), ("phase_field.max_dt_tau0", "0.24", "0.2"),
            ("seed[0].angle_deg", "0.0", "30.0"), ("seed[0].radius_W0", "8.0", "8.5"), ("mesh.levels", "3", "2"),
            ("mesh.max_regrid_steps", "50", "10"), ("flow", "absent", "present")]
-BLOCKS = [("mesh.block_cells", "8", "16"), ("mesh.root_blocks", "[2, 1]", "[4, 2]"), ("mesh.size_W0", "[64.0, 32.0]", "[128.0, 64.0]")]
+BLOCKS = [("mesh.block_cells", "8", "16"), ("mesh.root_blocks", "[2, 1]", "[4, 2]"),
+          ("mesh.size_W0", "[64.0, 32.0]", "[128.0, 64.0]")]
 FREE = [("run.title", '""', '"longer"'), ("run.end_time_tau0", "100.0", "200.0"), ("run.max_steps", "21", "25"),
         ("run.wall_clock_limit_s", "0.0", "1000.0"), ("output.checkpoint_every_steps", "10", "3"),
         ("output.plot_every_tau0", "unset", "2.0"), ("parallel.partitioner", '"curve"', '"graph"')]
@@ -89,15 +91,28 @@ def check_seeds_file(folder):
     say("another content of the file of seeds: refused")
 
 
+def checkpoints(folder):
+    return sorted(p.name for p in (folder / "run").glob("chk_*"))
+
+
 def check_given_up(folder):
     """After a restart from an older checkpoint, the later ones are those of another course."""
     (folder / "scene.toml").write_text(SCENE)
     run("scene.toml", cwd=folder)
+    shutil.copytree(folder / "run", folder / "copy")
+    # Stopped before it writes anything new, a restart has already dropped what was later.
+    run("scene.toml", "run.wall_clock_limit_s=1e-6", "--restart", "run/chk_0000010.h5", code=75, cwd=folder)
+    listed = [e["name"] for e in json.loads((folder / "run/plt.hdf.series").read_text())["files"]]
+    plotfiles = sorted(p.name for p in (folder / "run").glob("plt_*"))
+    require(listed == plotfiles == ["plt_0000000.hdf"], f"plotfiles later than the checkpoint: {listed}, {plotfiles}")
+    require(max(column(folder / "run/diagnostics.csv", "step", int)) <= 10, "lines later than the checkpoint")
+    shutil.rmtree(folder / "run")
+    (folder / "copy").rename(folder / "run")
     run("scene.toml", "run.max_steps=15", "--restart", "run/chk_0000010.h5", cwd=folder)
-    require(sorted(p.name for p in (folder / "run").glob("chk_*")) == ["chk_0000010.h5", "chk_0000020.h5.old"], "checkpoints set aside")
+    require(checkpoints(folder) == ["chk_0000010.h5", "chk_0000020.h5.old"], f"set aside: {checkpoints(folder)}")
     result = run("scene.toml", "--restart", "run", cwd=folder)
     require("restart from run/chk_0000010.h5" in result.out, f"the later checkpoint of another course: {result}")
-    require(sorted(p.name for p in (folder / "run").glob("chk_*")) == ["chk_0000010.h5", "chk_0000020.h5"], "checkpoints at the end")
+    require(checkpoints(folder) == ["chk_0000010.h5", "chk_0000020.h5"], f"at the end: {checkpoints(folder)}")
     say("a restart from an older checkpoint gives up the later ones")
 
 
