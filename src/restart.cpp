@@ -20,11 +20,13 @@ std::optional<std::vector<double>> number(const io::RunState& state, const std::
   return found == state.numbers.end() ? std::nullopt : std::optional(found->second);
 }
 
-// How long, what is written and who computes it do not change the course.
+// How long, what is written, who computes it and what is done after a fault do not change the course.
 bool free_to_change(const std::string& key) {
   constexpr const char* RUN[] = {"run.title", "run.end_time_s", "run.end_time_tau0", "run.max_steps",
                                  "run.wall_clock_limit_s"};
-  return key.starts_with("output.") || key.starts_with("parallel.") || std::ranges::find(RUN, key) != std::end(RUN);
+  constexpr const char* TABLES[] = {"output", "parallel", "guard"};
+  const std::string table = key.substr(0, key.find('.'));
+  return std::ranges::find(TABLES, table) != std::end(TABLES) || std::ranges::find(RUN, key) != std::end(RUN);
 }
 
 std::vector<io::InputChange> changes(const Settings& settings, const io::RunState& state) {
