@@ -3,6 +3,7 @@
 a final name, and the last checkpoint as it was. Needs a file system of its own, which only root can mount."""
 import atexit
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -10,7 +11,7 @@ import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "lib"))
-from support import Result, check_result, command_line, environment, read_csv, require, run, say, scratch
+from support import BUILD, Result, check_result, command_line, environment, read_csv, require, run, say, scratch
 
 SCENE = """
 [run]
@@ -113,8 +114,9 @@ def without_reserving(folder, disk, checkpoint, content):
     code = "#include <errno.h>\n" + "".join(f"int {f}(int a, int b, long c, long d) {{ errno = EOPNOTSUPP; return -1; }}\n"
                                              for f in ("fallocate", "fallocate64"))
     compiler = shutil.which("cc") or shutil.which("gcc")
-    if not compiler:
-        return say("no C compiler: nothing about file systems that cannot reserve space")
+    sanitized = re.search(r"^DENDRIFT_SANITIZE:\w+=\w", (BUILD / "CMakeCache.txt").read_text(), re.M)
+    if not compiler or sanitized:  # sanitizers want to be the first library themselves
+        return say("no C compiler, or a sanitizer: nothing about file systems that cannot reserve space")
     subprocess.run([compiler, "-shared", "-fPIC", "-w", "-x", "c", "-o", library, "-"], input=code, text=True, check=True)
     os.environ["LD_PRELOAD"] = str(library)
     try:
