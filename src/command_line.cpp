@@ -17,7 +17,8 @@ CommandLine parse_command_line(int argc, char** argv, bool print) {
   app.add_flag("--check", c.check, "validate the input, print derived numbers and an estimate of the cost, and stop");
   app.add_flag("--keys", c.keys, "list every key of the input: unit, default, range, meaning");
   app.add_flag("--markdown", c.markdown, "with --keys: as the page docs/keys.md");
-  const CLI::Option* restart = app.add_option("--restart", c.restart, "checkpoint, or a folder of checkpoints, to continue from");
+  const CLI::Option* restart = app.add_option("--restart", c.restart, "checkpoint, or a folder whose newest sound one is taken, to continue from");
+  app.add_flag("--allow-changes", c.allow_changes, "with --restart: even if the input has other physics than the checkpoint");
   app.add_flag("--version", version, "version, commit, compiler and flags");
   try {
     app.parse(argc, argv);

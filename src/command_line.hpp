@@ -12,6 +12,7 @@ struct CommandLine {
   std::string input;
   std::vector<std::string> overrides;  ///< section.key=value
   std::string restart;
+  bool allow_changes = false;  ///< a restart may change physics
   bool check = false, keys = false, markdown = false;
   std::optional<int> exit_code;  ///< nothing left to do: --help, --version, a usage error (2)
 };

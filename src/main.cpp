@@ -5,11 +5,15 @@
 #include <mpi.h>
 
 #include <csignal>
+#include <cstdio>
+#include <cstdlib>
 #include <exception>
+#include <memory>
 
 #include "command_line.hpp"
 #include "io/hdf5.hpp"
 #include "io/manifest.hpp"
+#include "restart.hpp"
 #include "settings.hpp"
 #include "simulation.hpp"
 
@@ -17,7 +21,15 @@ namespace {
 
 using namespace dendrift;
 
-void on_signal(int) { Simulation::request_stop(); }
+void on_signal(int number) {
+  static volatile std::sig_atomic_t interrupted = 0;
+  if (number == SIGINT && interrupted != 0) {  // who asks twice does not want to wait for a checkpoint
+    std::signal(SIGINT, SIG_DFL);
+    std::raise(SIGINT);
+  }
+  if (number == SIGINT) interrupted = 1;
+  Simulation::request_stop();
+}
 
 int run(const CommandLine& command, bool root) {
   // 1. What is asked for
@@ -29,17 +41,17 @@ int run(const CommandLine& command, bool root) {
   settings.parse(command.input, command.overrides);
 
   // 2. The state: a fresh one, or that of a checkpoint
-  std::optional<std::string> checkpoint;
-  if (!command.restart.empty()) checkpoint = io::find_checkpoint(command.restart);
-  Simulation simulation(settings, MPI_COMM_WORLD, checkpoint);
+  const std::unique_ptr<Simulation> simulation =
+      command.restart.empty() ? std::make_unique<Simulation>(settings, MPI_COMM_WORLD)
+                              : restart(settings, MPI_COMM_WORLD, command.restart, command.allow_changes);
   if (command.check) {
-    simulation.print_check();
+    simulation->print_check();
     return 0;
   }
 
   // 3. The run
   for (const int s : {SIGTERM, SIGINT, SIGUSR1}) std::signal(s, on_signal);
-  return simulation.run() == Outcome::stopped ? exit_code::stopped : exit_code::done;
+  return simulation->run() == Outcome::stopped ? exit_code::stopped : exit_code::done;
 }
 
 }  // namespace
@@ -65,6 +77,11 @@ int main(int argc, char** argv) {
   } catch (const std::exception& e) {
     fail(1, fmt::format("rank {}: {}", rank, e.what()));
     MPI_Abort(MPI_COMM_WORLD, 1);  // one rank alone: the others would wait forever
+  }
+  if (code == exit_code::output_failure) {
+    MPI_Barrier(MPI_COMM_WORLD);  // the message is out before a launcher ends the others
+    std::fflush(nullptr);
+    if (io::hdf5_is_broken()) std::_Exit(code);
   }
   MPI_Finalize();
   return code;

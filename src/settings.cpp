@@ -7,9 +7,14 @@
 #include <array>
 #include <cmath>
 #include <filesystem>
+#include <fstream>
+#include <iterator>
 #include <optional>
+#include <span>
 #include <stdexcept>
 #include <utility>
+
+#include "io/crc32.hpp"
 
 namespace dendrift {
 
@@ -105,6 +110,7 @@ void OutputOptions::declare(io::Schema& schema) {
   t.real("diagnostics_every_tau0", diagnostics_every_tau0).unit("tau0").above(0).doc("the same in units of tau0");
   t.real("checkpoint_every_s", checkpoint_every_s).unit("s").at_least(0).doc("simulated time between checkpoints; 0: none but at the end of a stopped run");
   t.integer("checkpoint_every_steps", checkpoint_every_steps).at_least(0).doc("time steps between checkpoints; 0: none");
+  t.real("checkpoint_every_wall_s", checkpoint_every_wall_s).unit("s").at_least(0).doc("running time between checkpoints; 0: none");
   t.integer("keep_checkpoints", keep_checkpoints).at_least(1).doc("checkpoints kept; older ones are removed");
   schema.check({"output"}, [this](io::Checks& c) {
     override_twin(c, "output.plot_every_s", plot_every_s, "output.plot_every_tau0", plot_every_tau0);
@@ -210,6 +216,11 @@ void Settings::derive() {
   for (int a = 0; a < DIM; ++a) size[a] = mesh.size_w0 ? (*mesh.size_w0)[a] : (*mesh.size_um)[a] / scales.w0_um;
   shape = choose_shape(size, mesh);
   crystals = physics::make_seeds(all_seeds(shape, scales), scales);
+  if (!seeding.file.empty()) {
+    std::ifstream in(std::filesystem::path(folder_) / seeding.file, std::ios::binary);
+    const std::string text((std::istreambuf_iterator<char>(in)), {});
+    seeds_checksum_ = io::crc32(std::as_bytes(std::span(text)));
+  }
   const auto in_tau0 = [&](const std::optional<double>& s, const std::optional<double>& tau0, double otherwise) {
     return tau0 ? *tau0 : s ? *s / scales.tau0_s : otherwise;
   };

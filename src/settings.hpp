@@ -54,6 +54,7 @@ struct OutputOptions {
   std::optional<double> diagnostics_every_s, diagnostics_every_tau0;
   double checkpoint_every_s = 0;
   std::int64_t checkpoint_every_steps = 0;
+  double checkpoint_every_wall_s = 0;
   int keep_checkpoints = 2;
 
   void declare(io::Schema& schema);
@@ -91,12 +92,15 @@ class Settings {
   double end_time = 0;              ///< tau0
   double plot_interval = 0;         ///< tau0; 0: only the last state
   double diagnostics_interval = 0;  ///< tau0
+  /// Of the text of the file of seeds, if there is one.
+  std::optional<std::uint32_t> seeds_checksum() const { return seeds_checksum_; }
   bool has_flow() const { return schema.has_table("flow"); }
 
  private:
   void derive();
   std::vector<physics::SeedOptions> all_seeds(const amr::MeshShape& shape, const physics::Scales& s) const;
   std::string folder_;  // of the input file
+  std::optional<std::uint32_t> seeds_checksum_;
 };
 
 /// Root blocks and levels whose finest cubic cells do not exceed dx: few root blocks under a deep tree, as long as the

@@ -1,6 +1,8 @@
 #include "simulation.hpp"
 
 #include <fmt/format.h>
+#include <fmt/ranges.h>
+#include <omp.h>
 
 #include <algorithm>
 #include <cmath>
@@ -16,6 +18,7 @@
 #include "physics/alloy_kernel.hpp"
 #include "physics/modules.hpp"
 #include "physics/motion.hpp"
+#include "restart.hpp"
 
 namespace dendrift {
 
@@ -25,17 +28,9 @@ volatile std::sig_atomic_t stop_requested = 0;
 
 constexpr double DIAGNOSTICS_TOLERANCE = 1e-9;  // of a time, relative: reached
 
-std::size_t at(int i) { return static_cast<std::size_t>(i); }
+constexpr const char* GIVEN_UP = ".old";  // follows the name of a checkpoint that is later than a restart
 
-// What a restart cannot change: the state would lose its meaning.
-std::vector<double> shape_numbers(const Settings& s, std::size_t crystals) {
-  std::vector<double> n{static_cast<double>(s.shape.block_cells), static_cast<double>(s.shape.max_level),
-                        s.shape.root_dx,  s.scales.k, s.scales.lambda, s.scales.w0_um, s.scales.tau0_s,
-                        s.scales.supersaturation, static_cast<double>(crystals)};
-  for (int a = 0; a < DIM; ++a) n.push_back(s.shape.root_blocks[a]);
-  for (const amr::Side side : s.shape.sides) n.push_back(static_cast<double>(side));
-  return n;
-}
+std::size_t at(int i) { return static_cast<std::size_t>(i); }
 
 // The first multiple of an interval that lies after t.
 std::int64_t next_multiple(double t, double interval) {
@@ -61,9 +56,9 @@ class Compensated {
 
 void Simulation::request_stop() { stop_requested = 1; }
 
-Simulation::Simulation(Settings& settings, MPI_Comm comm, const std::optional<std::string>& checkpoint)
+Simulation::Simulation(Settings& settings, MPI_Comm comm, const std::optional<std::string>& checkpoint, bool allow_changes)
     : settings_(settings), comm_(comm), crystals_(settings.crystals) {
-  wall_start_ = MPI_Wtime();
+  wall_start_ = last_save_ = MPI_Wtime();
   started_ = io::time_stamp();
   modules_ = physics::make_modules(settings, crystals_);
   amr::FieldTable fields;
@@ -75,7 +70,7 @@ Simulation::Simulation(Settings& settings, MPI_Comm comm, const std::optional<st
   c_ = field("c");
   for (const auto& m : modules_) m->attach(*mesh_, *ghosts_);
   if (checkpoint) {
-    resume(*checkpoint);
+    resume(*checkpoint, allow_changes);
   } else {
     build_initial_mesh();
     initial_solute_ = totals().solute_mean;
@@ -108,16 +103,17 @@ void Simulation::require_memory(std::int64_t blocks, const amr::FieldTable& fiel
                   settings_.shape.block_cells, 1e-9 * m.needed));
 }
 
-void Simulation::resume(const std::string& file) {
+void Simulation::resume(const std::string& file, bool allow_changes) {
   const io::RunState s = io::read_state(file, comm_);
   const auto list = [&](const char* name) -> const std::vector<double>& {
     const auto found = s.numbers.find(name);
     if (found == s.numbers.end()) throw io::OutputError(file, "restart", std::string("it does not hold ") + name);
     return found->second;
   };
-  if (list("shape") != shape_numbers(settings_, crystals_.size()))
-    throw io::OutputError(file, "restart", "the input describes another box, mesh, alloy or set of seeds than the checkpoint");
+  require_same_scene(settings_, file, s, allow_changes);
   require_later_end(file, s);
+  if (const auto missing = io::missing_fields(file, *mesh_); !missing.empty())
+    throw io::OutputError(file, "restart", fmt::format("it does not hold what the input asks for: field {}", fmt::join(missing, ", ")));
   amr::Tree tree = mesh_->tree();
   try {
     tree = amr::Tree(settings_.shape.root_blocks, settings_.shape.periodic(), settings_.shape.max_level,
@@ -133,7 +129,7 @@ void Simulation::resume(const std::string& file) {
   mesh_->install(std::move(tree), std::move(owners), fresh);
   io::read_fields(file, *mesh_);
   time_ = s.time;
-  step_ = s.step;
+  step_ = first_step_ = s.step;
   const auto take = [&](const char* name) { return list(name).at(0); };
   next_regrid_ = static_cast<std::int64_t>(take("next_regrid"));
   // Counted anew, because a restart may have other intervals.
@@ -153,6 +149,12 @@ void Simulation::resume(const std::string& file) {
   resumed_ = true;
   starting_ = false;
   for (const auto& m : modules_) m->after_regrid();
+  if (mesh_->rank() == 0) fmt::print("{}", restart_log(settings_, file, s, origin()));
+}
+
+std::string Simulation::origin() const {
+  const std::string version = io::version_text();
+  return fmt::format("ranks {}, threads {}, {}", mesh_->ranks(), omp_get_max_threads(), version.substr(0, version.find('\n')));
 }
 
 void Simulation::require_later_end(const std::string& file, const io::RunState& s) const {
@@ -171,7 +173,9 @@ io::RunState Simulation::state() const {
   s.step = step_;
   s.input = settings_.schema.resolved_toml();
   s.numbers["next_regrid"] = {static_cast<double>(next_regrid_)};
-  s.numbers["shape"] = shape_numbers(settings_, crystals_.size());
+  s.origin = origin();
+  s.numbers["shape"] = shape_numbers(settings_);
+  if (const auto seeds = settings_.seeds_checksum()) s.numbers["seeds_file"] = {static_cast<double>(*seeds)};
   s.numbers["last_line_step"] = {static_cast<double>(last_line_step_)};
   s.numbers["initial_solute"] = {initial_solute_};
   for (const physics::Seed& g : crystals_) {
@@ -281,15 +285,14 @@ Outcome Simulation::run_to_end() {
       plots_ = next_multiple(time_, settings_.plot_interval);
     }
     if (end) break;
-    const bool steps_due = settings_.output.checkpoint_every_steps > 0 && step_ > 0 &&
+    const bool steps_due = settings_.output.checkpoint_every_steps > 0 && step_ > first_step_ &&
                            step_ % settings_.output.checkpoint_every_steps == 0;
-    if (due(checkpoints_ + 1, checkpoint_interval) || steps_due) {
+    const Request request = agreed_request();
+    if (due(checkpoints_ + 1, checkpoint_interval) || steps_due || request != Request::none) {
       checkpoints_ = next_multiple(time_, checkpoint_interval) - 1;
       clock_.time("checkpoint", [&] { save(); });
     }
-    const double limit = settings_.run.wall_clock_limit_s;
-    if (amr::global_any(stop_requested != 0 || (limit > 0 && MPI_Wtime() - wall_start_ > limit), comm_)) {
-      clock_.time("checkpoint", [&] { save(); });
+    if (request == Request::stop) {
       write_manifest("stopped", exit_code::stopped);
       return Outcome::stopped;
     }
@@ -301,6 +304,14 @@ Outcome Simulation::run_to_end() {
   }
   write_manifest("done", exit_code::done);
   return Outcome::done;
+}
+
+Simulation::Request Simulation::agreed_request() const {
+  const double now = MPI_Wtime(), limit = settings_.run.wall_clock_limit_s, every = settings_.output.checkpoint_every_wall_s;
+  Request mine = Request::none;
+  if (every > 0 && now - last_save_ > every) mine = Request::checkpoint;
+  if (stop_requested != 0 || (limit > 0 && now - wall_start_ > limit)) mine = Request::stop;
+  return static_cast<Request>(amr::global_max(static_cast<double>(mine), comm_));
 }
 
 void Simulation::print_check() {
@@ -398,23 +409,14 @@ void Simulation::open_output() {
                    : "time_s,grain,x_um,y_um,z_um,vx_um_s,vy_um_s,vz_um_s,omega_x_rad_s,omega_y_rad_s,omega_z_rad_s,"
                      "q0,q1,q2,q3,volume_um3,nonrigidity,contacts";
       const double now = time_ * settings_.scales.tau0_s;
+      if (resumed_) find_saved();
+      remove_leftovers();
       if (resumed_) {
+        io::cut_series(path("plt.hdf.series"), now);
         grains_csv_ = std::make_unique<io::CsvFile>(path("grains.csv"), grains, "time_s", now);
-        const std::string own = checkpoint_name();
         diagnostics_csv_ = std::make_unique<io::CsvFile>(path("diagnostics.csv"), diagnostics, "time_s", now);
         tips_csv_ = std::make_unique<io::CsvFile>(path("tips.csv"), tips, "time_s", now);
-        // Checkpoints from before the restart count as well. Later ones belong to a course that is given up.
-        for (const std::string& name : io::list_checkpoints(settings_.output.dir)) saved_.push_back(path(name));
-        const auto later = [&](const std::string& file) { return file.size() > own.size() || file > own; };
-        std::stable_partition(saved_.begin(), saved_.end(), later);
       } else {
-        for (const auto& e : std::filesystem::directory_iterator(settings_.output.dir)) {
-          const std::string name = e.path().filename().string();
-          // What an earlier run left here would be mistaken for this one's.
-          if (name == "plt.hdf.series" || (name.starts_with("plt_") && name.ends_with(".hdf")) ||
-              (name.starts_with("chk_") && name.ends_with(".h5")))
-            std::filesystem::remove(e.path());
-        }
         diagnostics_csv_ = std::make_unique<io::CsvFile>(path("diagnostics.csv"), diagnostics);
         tips_csv_ = std::make_unique<io::CsvFile>(path("tips.csv"), tips);
         grains_csv_ = std::make_unique<io::CsvFile>(path("grains.csv"), grains);
@@ -422,6 +424,42 @@ void Simulation::open_output() {
     });
   failure.agree(comm_);
   write_manifest("running");
+}
+
+// Checkpoints from before the restart count as well. Later ones belong to a course that is given up: the next restart must not
+// take them, so this comes before anything of that course is removed, and they are the first to go.
+void Simulation::find_saved() {
+  const std::string own = checkpoint_name();
+  std::vector<std::string> earlier;
+  for (const std::string& name : io::list_checkpoints(settings_.output.dir)) {
+    const std::string file = path(name);
+    if (file.size() < own.size() || (file.size() == own.size() && file <= own))
+      earlier.push_back(file);
+    else
+      io::complete_file(file, file + GIVEN_UP);
+  }
+  for (const auto& e : std::filesystem::directory_iterator(settings_.output.dir)) {
+    const std::string name = e.path().filename().string();
+    if (name.starts_with("chk_") && name.ends_with(std::string(".h5") + GIVEN_UP)) saved_.push_back(path(name));
+  }
+  saved_.insert(saved_.end(), earlier.begin(), earlier.end());
+}
+
+void Simulation::remove_leftovers() const {
+  const std::string last_plot = plot_name();
+  const auto plotfile = [](const std::string& name) { return name.starts_with("plt_") && name.ends_with(".hdf"); };
+  const auto later = [&](const std::string& name) { return name.size() > last_plot.size() || name > last_plot; };
+  std::vector<std::filesystem::path> useless;
+  for (const auto& e : std::filesystem::directory_iterator(settings_.output.dir)) {
+    const std::string name = e.path().filename().string();
+    const bool output = name.starts_with("plt_") || name.starts_with("chk_");
+    const bool torn = output && name.ends_with(".part");
+    // What an earlier run left here would be mistaken for this one's. A restart goes on with what it had written by then.
+    const bool stale = resumed_ ? plotfile(name) && later(name)
+                                : name == "plt.hdf.series" || plotfile(name) || (output && (name.ends_with(".h5") || name.ends_with(GIVEN_UP)));
+    if (torn || stale) useless.push_back(e.path());
+  }
+  for (const auto& p : useless) std::filesystem::remove(p);
 }
 
 physics::Report Simulation::report() const {
@@ -561,7 +599,7 @@ void Simulation::write_plotfile() {
         out[i++] = psi[q] > 0 ? grain[q] : -1.0;
       });
     };
-  const std::string name = fmt::format("plt_{:07d}.hdf", step_);
+  const std::string name = plot_name();
   write_plot(path(name), *mesh_, s, time_ * s.tau0_s, step_, fields);
   io::SharedFailure failure;
   if (mesh_->rank() == 0)
@@ -572,11 +610,18 @@ void Simulation::write_plotfile() {
 
 void Simulation::write_checkpoint(const std::string& file) { io::write_checkpoint(file, *mesh_, state()); }
 
+std::string Simulation::plot_name() const { return fmt::format("plt_{:07d}.hdf", step_); }
+
 std::string Simulation::checkpoint_name() const { return path(fmt::format("chk_{:07d}.h5", step_)); }
 
 void Simulation::save() {
   const std::string file = checkpoint_name();
+  io::SharedFailure failure;  // a restart from this checkpoint relies on the lines before it
+  for (io::CsvFile* csv : {diagnostics_csv_.get(), tips_csv_.get(), grains_csv_.get()})
+    if (csv != nullptr) failure.attempt(settings_.output.dir, "bring lines to the disk", [&] { csv->sync(); });
+  failure.agree(comm_);
   write_checkpoint(file);
+  last_save_ = MPI_Wtime();
   if (mesh_->rank() != 0) return;
   std::erase(saved_, file);
   saved_.push_back(file);

@@ -58,8 +58,10 @@ inline constexpr int done = 0, bad_input = 2, numerical_failure = 3, output_fail
 
 class Simulation {
  public:
-  /// Builds the mesh and the initial state, or reads it from a checkpoint. Nothing is written. Collective.
-  Simulation(Settings& settings, MPI_Comm comm, const std::optional<std::string>& checkpoint = std::nullopt);
+  /// Builds the mesh and the initial state, or reads it from a checkpoint, which must go with the input unless
+  /// `allow_changes` (see require_same_scene). Nothing is written. Collective.
+  Simulation(Settings& settings, MPI_Comm comm, const std::optional<std::string>& checkpoint = std::nullopt,
+             bool allow_changes = false);
   ~Simulation();
 
   /// Steps to the end, writing output. Returns `stopped` after a checkpoint if asked to stop (request_stop, wall
@@ -92,15 +94,21 @@ class Simulation {
  private:
   void build_initial_mesh();
   void require_memory(std::int64_t blocks, const amr::FieldTable& fields) const;
-  void resume(const std::string& path);
+  void resume(const std::string& path, bool allow_changes);
+  std::string origin() const;
   void require_later_end(const std::string& file, const io::RunState& s) const;
   bool adapt(double max_imbalance);
   void schedule_regrid();
   double next_stop() const;
   void check_finite(const Totals& t) const;
 
+  enum class Request : std::uint8_t { none, checkpoint, stop };
+  /// What signals and the wall clock ask for, the same on all ranks. Collective.
+  Request agreed_request() const;
   Outcome run_to_end();
   void open_output();
+  void find_saved();
+  void remove_leftovers() const;
   void write_line(const Totals& t, double dt);
   void write_tips(io::SharedFailure& failure);
   void write_grains(io::SharedFailure& failure);
@@ -110,6 +118,7 @@ class Simulation {
   void write_manifest(const std::string& status, std::optional<int> exit_code = std::nullopt);
   void record_failure(int exit_code, const std::string& message) const;  // not collective, throws nothing of its own
   void progress(const Totals& t, double dt, bool last);
+  std::string plot_name() const;
   std::string checkpoint_name() const;
   std::string path(const std::string& name) const { return settings_.output.dir + "/" + name; }
   io::RunState state() const;
@@ -122,7 +131,7 @@ class Simulation {
   std::vector<physics::Seed> crystals_;
   amr::CellField psi_, c_;
   double time_ = 0;  // tau0
-  std::int64_t step_ = 0;
+  std::int64_t step_ = 0, first_step_ = 0;  // that of the checkpoint after a restart
   std::int64_t next_regrid_ = 0;
   std::int64_t plots_ = 0, lines_ = 0, checkpoints_ = 0;  // written so far: the next is due at that multiple
   double initial_solute_ = 0;
@@ -132,7 +141,7 @@ class Simulation {
   std::unique_ptr<io::CsvFile> diagnostics_csv_, tips_csv_, grains_csv_;
   std::vector<std::string> saved_;  // rank 0: checkpoints in the folder, the next to be removed first
   PhaseClock clock_;
-  double wall_start_ = 0, last_progress_ = 0;
+  double wall_start_ = 0, last_save_ = 0, last_progress_ = 0;
   std::string started_;
 };
 

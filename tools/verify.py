@@ -665,6 +665,29 @@ def falling_disc():
     write("falling_disc", rows)
 
 
+@case
+def drafting():
+    """Two discs that fall one behind the other (Feng, Hu & Joseph 1994): the one behind catches up, they touch, and change over."""
+    rows = []
+    for solid in ("viscous", "penalised"):
+        r = FlowRun("drafting_discs.toml", f"flow.solid={solid}")
+        behind, ahead = (sorted((g for g in r.grains if g["grain"] == n), key=lambda g: g["time_s"]) for n in (0, 1))
+        nu, d = 0.6, 16
+        seen = []  # time, gap, slope of the line of centres to gravity, mean speed of both
+        for b, a in zip(behind, ahead):
+            dx, dy = b["x_um"] - a["x_um"], b["y_um"] - a["y_um"]
+            seen.append((b["time_s"], math.hypot(dx, dy) - d, math.degrees(math.atan2(abs(dx), dy)), -(a["vy_um_s"] + b["vy_um_s"]) / 2))
+        least = min(seen, key=lambda row: row[1])
+        met = next((row for row in seen if row[1] < 2), None)
+        over = next((row for row in seen if row[2] > 90), None)
+        rows.append({"solid": solid, "Re": max(row[3] for row in seen) * d / nu, "behind_over_ahead_at_meeting":
+                     next((b["vy_um_s"] / a["vy_um_s"] for b, a in zip(behind, ahead) if met and b["time_s"] >= met[0] - 20), ""),
+                     "kiss_s": met[0] / 106.67 if met else "", "least_gap_W0": least[1], "change_over_s": over[0] / 106.67 if over else "",
+                     "angle_at_end_deg": seen[-1][2], "gap_at_end_W0": seen[-1][1],
+                     "shortest_step_tau0": min(x["dt_tau0"] for x in r.diagnostics[1:])} | r.cost())
+    write("drafting", rows)
+
+
 GHIA = {  # place, velocity along the lid (x = 1/2) at Re 100 and 1000; place, velocity across it (y = 1/2)
     "u": ((0.0547, -0.03717, -0.18109), (0.0625, -0.04192, -0.20196), (0.0703, -0.04775, -0.22220), (0.1016, -0.06434, -0.29730),
           (0.1719, -0.10150, -0.38289), (0.2813, -0.15662, -0.27805), (0.4531, -0.21090, -0.10648), (0.5, -0.20581, -0.06080),

@@ -18,26 +18,35 @@ struct RunState {
   std::int64_t step = 0;
   std::map<std::string, std::vector<double>> numbers;  ///< whatever else the program must remember, by name
   std::string input;                                   ///< the resolved input, TOML
+  std::string origin;  ///< one line on the program, ranks and threads; does not count as state
+  int dim = DIM;
+  int format = 0;  ///< of the file that it was read from
 };
 
-inline constexpr int CHECKPOINT_FORMAT = 1;
+/// 1: no checksums. 2: a seal (io/seal.hpp), and a checksum of every leaf of every field.
+inline constexpr int CHECKPOINT_FORMAT = 2;
 
-/// Writes path + ".part", syncs, and renames. Collective; throws OutputError on every rank or none.
-void write_checkpoint(const std::string& path, const amr::Mesh& mesh, const RunState& state);
+// All but the first function are collective, and throw OutputError on every rank or none.
 
-/// Names of the chk_*.h5 of a folder, by number.
+/// Names of the chk_*.h5 of a folder, by number. One rank calls it.
 std::vector<std::string> list_checkpoints(const std::string& dir);
 
-/// The newest chk_*.h5 of a folder, or the file itself. Throws OutputError if there is none.
-std::string find_checkpoint(const std::string& file_or_dir);
+/// The file itself, or the chk_*.h5 of a folder, newest first. At least one.
+std::vector<std::string> find_checkpoints(const std::string& file_or_dir, MPI_Comm comm);
 
-/// Number and input only. Collective.
+/// Writes path + ".part", has it brought to the disk, and renames it. After a failure nothing of it is left.
+void write_checkpoint(const std::string& path, const amr::Mesh& mesh, const RunState& state);
+
+/// All but leaves and fields. Refuses files that are damaged beside the values of fields, or of a newer version.
 RunState read_state(const std::string& path, MPI_Comm comm);
 
-/// The leaves stored in a checkpoint. Collective.
+/// The leaves stored in a checkpoint.
 std::vector<amr::BlockIndex> read_leaves(const std::string& path, MPI_Comm comm);
 
-/// Reads the fields of this rank's blocks; the mesh must hold the leaves of the checkpoint. Collective.
+/// Fields that the mesh wants from a checkpoint and the file does not hold.
+std::vector<std::string> missing_fields(const std::string& path, const amr::Mesh& mesh);
+
+/// Reads the fields of this rank's blocks, and checks their checksums; the mesh must hold the leaves of the checkpoint.
 void read_fields(const std::string& path, amr::Mesh& mesh);
 
 }  // namespace dendrift::io

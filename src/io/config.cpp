@@ -100,9 +100,13 @@ Schema::Place Schema::place_of(const std::string& key) const {
   return place;
 }
 
-InputError Schema::error(const std::string& key, std::string expected, std::string found) const {
+InputIssue Schema::issue(const std::string& key, std::string expected, std::string found) const {
   const Place place = place_of(key);
-  return InputError({{place.where, key, std::move(expected), found.empty() ? place.found : std::move(found), ""}});
+  return {place.where, key, std::move(expected), found.empty() ? place.found : std::move(found), ""};
+}
+
+InputError Schema::error(const std::string& key, std::string expected, std::string found) const {
+  return InputError({issue(key, std::move(expected), std::move(found))});
 }
 
 bool Checks::overridden(const std::string& key) const {

@@ -28,6 +28,11 @@ struct InputIssue {
   std::string key, expected, found, hint;
 };
 
+/// A key, or a table, that stands differently in two inputs.
+struct InputChange {
+  std::string key, before, after;
+};
+
 /// Every problem of one input; what() counts them and gives a paragraph to each.
 class InputError : public std::runtime_error {
  public:
@@ -277,12 +282,16 @@ class Schema {
   bool given(const std::string& key) const { return given_.contains(key); }  ///< "table.key", "list[i].key"
   /// A problem with `key` that shows only after parsing, to be thrown; `found` empty: what the input says there.
   InputError error(const std::string& key, std::string expected, std::string found = {}) const;
+  InputIssue issue(const std::string& key, std::string expected, std::string found = {}) const;
 
   std::string keys_text() const;
   std::string keys_markdown() const;
   /// Every key of every list element and of every table that is present, implied or required, as TOML that
   /// parses back to the same values bit by bit.
   std::string resolved_toml() const;
+  /// What this input changes against the resolved one of another run, perhaps of another version: a key that only one of
+  /// them knows has its default in the other.
+  std::vector<InputChange> changes_since(const std::string& resolved) const;
 
  private:
   friend class Checks;
@@ -316,6 +325,7 @@ class Schema {
   Section& add_section(std::string name, std::string doc, Presence presence, bool is_list);
   const Section* find(const std::string& name) const;
   static std::string heading(const Section& section);
+  std::string default_of(const std::string& key) const;
   void verify_defaults() const;
   bool sound(const std::vector<std::string>& uses) const;
   Place place_of(const std::string& key) const;

@@ -2,6 +2,9 @@
 #include <fmt/format.h>
 #include <fmt/ranges.h>
 
+#include <set>
+#include <sstream>
+
 #include "io/config.hpp"
 #include "io/config_text.hpp"
 
@@ -25,6 +28,29 @@ std::string message(const std::vector<InputIssue>& issues) {
     text += fmt::format("\n\nand {} more", issues.size() - max_issues_printed);
   return text;
 }
+
+/// The lines of a resolved input by "table.key" or "list[i].key"; tables and elements of lists are there by themselves.
+std::map<std::string, std::string> flattened(const std::string& resolved) {
+  std::map<std::string, std::string> values;
+  std::map<std::string, int> elements;
+  std::string home;
+  std::istringstream lines(resolved);
+  for (std::string line; std::getline(lines, line);) {
+    const auto equals = line.find(" = ");
+    if (line.starts_with("[[")) {
+      const std::string name = line.substr(2, line.size() - 4);
+      home = fmt::format("{}[{}]", name, elements[name]++);
+    } else if (line.starts_with("[")) {
+      home = line.substr(1, line.size() - 2);
+    } else if (equals != std::string::npos) {
+      values[home + "." + line.substr(0, equals)] = line.substr(equals + 3);
+    }
+    if (line.starts_with("[")) values[home] = "";
+  }
+  return values;
+}
+
+std::string home_of(const std::string& key) { return key.substr(0, key.rfind('.')); }
 
 using Row = std::array<std::string, 6>;
 
@@ -112,6 +138,29 @@ std::string Schema::resolved_toml() const {
     }
   }
   return text;
+}
+
+std::string Schema::default_of(const std::string& key) const {
+  const std::string home = home_of(key);
+  const Section* section = find(home.substr(0, home.find('[')));
+  const KeySpec* spec = section ? section->table.find(key.substr(home.size() + 1)) : nullptr;
+  return !spec ? "unknown to this version" : spec->required ? "unset" : spec->default_text;
+}
+
+std::vector<InputChange> Schema::changes_since(const std::string& resolved) const {
+  const auto before = flattened(resolved), after = flattened(resolved_toml());
+  std::set<std::string> keys;
+  for (const auto* values : {&before, &after})
+    for (const auto& [key, value] : *values) keys.insert(key);
+  std::vector<InputChange> changes;
+  for (const std::string& key : keys) {
+    const bool table = home_of(key) == key, was = before.contains(key), is = after.contains(key);
+    if (table && was != is) changes.push_back({key, was ? "present" : "absent", is ? "present" : "absent"});
+    if (table || !before.contains(home_of(key)) || !after.contains(home_of(key))) continue;
+    const std::string a = was ? before.at(key) : default_of(key), b = is ? after.at(key) : default_of(key);
+    if (a != b) changes.push_back({key, a, b});
+  }
+  return changes;
 }
 
 }  // namespace dendrift::io

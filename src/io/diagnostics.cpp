@@ -1,6 +1,9 @@
 #include "io/diagnostics.hpp"
 
+#include <fcntl.h>
 #include <fmt/format.h>
+#include <sys/stat.h>
+#include <unistd.h>
 
 #include <algorithm>
 #include <cerrno>
@@ -57,28 +60,63 @@ std::string kept_lines(const std::string& path, std::string_view header, std::st
 
 }  // namespace
 
-CsvFile::CsvFile(std::string path, std::string_view header)
-    : path_(std::move(path)), file_(std::fopen(path_.c_str(), "w")) {
-  if (!file_) throw OutputError(path_, "create the file", std::strerror(errno));
-  write(std::string(header) + "\n");
-}
+CsvFile::CsvFile(std::string path, std::string_view header) : path_(std::move(path)) { start(std::string(header) + "\n"); }
 
 CsvFile::CsvFile(std::string path, std::string_view header, std::string_view time_column, double last_time)
     : path_(std::move(path)) {
-  const std::string kept = kept_lines(path_, header, time_column, last_time);
-  file_.reset(std::fopen(path_.c_str(), "w"));
-  if (!file_) throw OutputError(path_, "continue the file", std::strerror(errno));
-  write(kept);
+  start(kept_lines(path_, header, time_column, last_time));
 }
 
-void CsvFile::write(std::string_view text) {
-  if (std::fwrite(text.data(), 1, text.size(), file_.get()) != text.size() || std::fflush(file_.get()) != 0)
-    throw OutputError(path_, "write a line", std::strerror(errno));
+CsvFile::~CsvFile() {
+  if (file_ >= 0) ::close(file_);
+}
+
+void CsvFile::fail(const std::string& attempt, int error) const {
+  throw OutputError(path_, attempt, error == 0 ? "another file has its name" : std::strerror(error));
+}
+
+// The lines from before a restart must not be lost to a kill while they are written again.
+void CsvFile::start(std::string_view text) {
+  const std::string part = path_ + ".part";
+  try {
+    file_ = ::open(part.c_str(), O_WRONLY | O_CREAT | O_TRUNC | O_APPEND | O_CLOEXEC, 0666);
+    if (file_ < 0) fail("create the file", errno);
+    write(text);
+    complete_file(part, path_);
+  } catch (...) {
+    if (file_ >= 0) ::close(file_);
+    remove_quietly(part);
+    throw;
+  }
+}
+
+void CsvFile::write(std::string_view text) const {
+  const off_t end = ::lseek(file_, 0, SEEK_END);
+  while (!text.empty()) {
+    const ssize_t count = ::write(file_, text.data(), text.size());
+    if (count > 0) text.remove_prefix(static_cast<std::size_t>(count));
+    if (count > 0 || (count < 0 && errno == EINTR)) continue;
+    const int error = count < 0 ? errno : ENOSPC;
+    if (end >= 0 && ::ftruncate(file_, end) != 0) {}  // a torn line: a restart leaves it out
+    fail("write a line", error);
+  }
+}
+
+// Lines for a file that was removed or moved away would be lost without a word.
+void CsvFile::require_in_place() const {
+  struct stat own {}, found {};
+  if (::fstat(file_, &own) != 0 || ::stat(path_.c_str(), &found) != 0) fail("write a line", errno);
+  if (own.st_ino != found.st_ino || own.st_dev != found.st_dev) fail("write a line", 0);
+}
+
+void CsvFile::sync() const {
+  if (::fsync(file_) != 0) fail("bring lines to the disk", errno);
 }
 
 void CsvFile::line(const std::vector<double>& values) {
   std::string text;
   for (const double v : values) text += (text.empty() ? "" : ",") + number_text(v);
+  require_in_place();
   write(text + "\n");
 }
 

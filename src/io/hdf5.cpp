@@ -1,9 +1,9 @@
 #include "io/hdf5.hpp"
 
-#ifdef __linux__
 #include <fcntl.h>
-#include <sys/resource.h>
 #include <unistd.h>
+#ifdef __linux__
+#include <sys/resource.h>
 #endif
 
 #include <cerrno>
@@ -36,6 +36,21 @@ std::string detail::last_error() {
   if (reports.empty()) return "HDF5 gave no reason";
   if (reports.front() == reports.back()) return "HDF5: " + reports.front();
   return "HDF5: " + reports.back() + ": " + reports.front();
+}
+
+namespace {
+
+bool broken = false;
+
+}  // namespace
+
+bool hdf5_is_broken() noexcept { return broken; }
+
+herr_t Handle::close() {
+  if (id_ < 0) return 0;
+  const herr_t status = closer_(std::exchange(id_, -1));
+  broken = broken || status < 0;
+  return status;
 }
 
 Handle& Handle::operator=(Handle&& other) noexcept {
@@ -206,6 +221,13 @@ void Dataset::read(const Type& type, void* out, std::size_t count, const Dataspa
   throw OutputError(path(), "read dataset " + dataset_name(id()), reason);
 }
 
+FileRange Dataset::range() const {
+  const haddr_t offset = H5Dget_offset(id());
+  const hsize_t bytes = H5Dget_storage_size(id());
+  if (offset == HADDR_UNDEF) throw OutputError(path(), "find dataset " + dataset_name(id()), detail::last_error());
+  return {offset, bytes};
+}
+
 // ---- groups and files ---------------------------------------------------------------------------
 
 namespace {
@@ -283,9 +305,11 @@ hid_t open_file(const std::string& path, Access access, const Handle& properties
 
 }  // namespace
 
-File File::create(const std::string& path) {
+File File::create(const std::string& path, std::uint64_t room) {
   const Handle properties = access_properties(path);
-  const hid_t id = H5Fcreate(path.c_str(), H5F_ACC_TRUNC, H5P_DEFAULT, properties.id());
+  const Handle creation(check(H5Pcreate(H5P_FILE_CREATE), path, "prepare the file"), H5Pclose);
+  check(H5Pset_userblock(creation.id(), room), path, "prepare the file");
+  const hid_t id = H5Fcreate(path.c_str(), H5F_ACC_TRUNC, creation.id(), properties.id());
   return {check(id, path, "create the file"), H5Fclose, path};
 }
 
@@ -296,6 +320,8 @@ File File::open(const std::string& path, Access access) {
 File File::open(const std::string& path, Access access, MPI_Comm comm) {
   return {open_file(path, access, shared_access_properties(path, comm)), H5Fclose, path};
 }
+
+void File::flush() const { check(H5Fflush(id(), H5F_SCOPE_GLOBAL), path(), "write out the file"); }
 
 void File::close() { check(handle_.close(), path(), "close the file"); }
 
@@ -372,10 +398,26 @@ void release_excess_space(const std::string& path) {
   if (!ignored) std::filesystem::resize_file(path, size, ignored);
 }
 
-void rename_file(const std::string& from, const std::string& to) {
+namespace {
+
+void sync(const std::string& path, int flags, bool required) {
+  const int file = ::open(path.c_str(), flags | O_CLOEXEC);
+  int error = file < 0 ? errno : 0;
+  if (error == 0 && ::fsync(file) != 0) error = errno;
+  if (file >= 0) ::close(file);
+  if (error != 0 && required) throw OutputError(path, "bring the file to the disk", std::generic_category().message(error));
+}
+
+}  // namespace
+
+void complete_file(const std::string& part, const std::string& path) {
+  sync(part, O_RDONLY, true);
   std::error_code error;
-  std::filesystem::rename(from, to, error);
-  if (error) throw OutputError(to, "rename " + from + " to it", error.message());
+  std::filesystem::rename(part, path, error);
+  if (error) throw OutputError(path, "rename " + part + " to it", error.message());
+  // Some file systems cannot sync a folder. The file is whole either way; only its name might not outlive a power failure.
+  const std::string folder = std::filesystem::path(path).parent_path().string();
+  sync(folder.empty() ? "." : folder, O_RDONLY | O_DIRECTORY, false);
 }
 
 void remove_quietly(const std::string& path) noexcept {

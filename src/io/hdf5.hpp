@@ -45,12 +45,16 @@ class Handle {
   ~Handle() { close(); }
   [[nodiscard]] hid_t id() const { return id_; }
   /// Negative on failure; the identifier is given up in any case.
-  herr_t close() { return id_ < 0 ? 0 : closer_(std::exchange(id_, -1)); }
+  herr_t close();
 
  private:
   hid_t id_ = -1;
   Closer closer_ = nullptr;
 };
+
+/// Whether something could not be closed, for want of disk space as a rule. HDF5 1.10 then crashes when it ends, which is part
+/// of MPI_Finalize and of exit().
+[[nodiscard]] bool hdf5_is_broken() noexcept;
 
 /// The numbers that files hold. They are stored as they lie in memory.
 template <class T>
@@ -140,9 +144,16 @@ class Location {
   std::string path_;
 };
 
+/// Bytes of a file.
+struct FileRange {
+  std::uint64_t offset = 0, bytes = 0;
+};
+
 class Dataset : public Location {
  public:
   Dataset(hid_t id, std::string path) : Location(id, H5Dclose, std::move(path)) {}
+  /// Where the values of a contiguous dataset lie.
+  [[nodiscard]] FileRange range() const;
   /// Writes data, contiguous in memory, to the selected part of `where`, in the order of the file. In a
   /// collective transfer a rank with nothing to write passes no data and an empty selection.
   template <Number T>
@@ -206,12 +217,15 @@ enum class Access { read, write_values };
 /// A file, and its root group.
 class File : public Group {
  public:
-  /// For this rank alone; replaces a file of this name.
-  [[nodiscard]] static File create(const std::string& path);
+  /// For this rank alone; replaces a file of this name. The first `room` bytes, 0 or a power of 2 from 512 on, are left
+  /// to the caller.
+  [[nodiscard]] static File create(const std::string& path, std::uint64_t room = 0);
   /// For this rank alone.
   [[nodiscard]] static File open(const std::string& path, Access);
   /// For all ranks of the communicator together, as is the closing of the file.
   [[nodiscard]] static File open(const std::string& path, Access, MPI_Comm);
+  /// Every rank hands to the disk what it has written; only the rank that wrote can. Collective if the file is shared.
+  void flush() const;
   /// Writes what HDF5 still holds back, so it may notice a full disk; the destructor closes too, but
   /// silently. All groups and datasets of the file must be gone by then.
   void close();
@@ -269,8 +283,8 @@ void write_items(const Dataset&, const Share&, std::size_t length, SharedFailure
 void reserve_space(const std::string& path, std::uint64_t bytes);
 /// Gives back what lies beyond the end of the file. Not collective.
 void release_excess_space(const std::string& path);
-/// Moves a complete file to its final name. Not collective.
-void rename_file(const std::string& from, const std::string& to);
+/// Moves a complete file to its final name, file and name safe on the disk when it returns. Not collective.
+void complete_file(const std::string& part, const std::string& path);
 /// Removes what a failure left behind, if anything. Not collective.
 void remove_quietly(const std::string& path) noexcept;
 

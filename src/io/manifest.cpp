@@ -81,7 +81,7 @@ void write_manifest(const std::string& path, const Manifest& m) {
     remove_quietly(part);
     throw OutputError(part, "write the file", reason);
   }
-  rename_file(part, path);
+  complete_file(part, path);
 }
 
 }  // namespace dendrift::io

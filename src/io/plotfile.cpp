@@ -312,6 +312,8 @@ void write_part(const std::string& part, const PlotHeader& header, const PlotFil
   failure.agree(comm);
   write_values(data, header, fill, comm);
   data.clear();
+  failure.attempt(part, "write out the file", [&] { file->flush(); });
+  failure.agree(comm);
   failure.attempt(part, "close the file", [&] { file->close(); });
   failure.agree(comm);
 }
@@ -363,6 +365,17 @@ void write_series(const std::string& path, const std::vector<SeriesEntry>& entri
   if (!out) throw OutputError(path, "write the list of plotfiles", std::generic_category().message(errno));
 }
 
+void replace_series(const std::string& path, const std::vector<SeriesEntry>& entries) {
+  const std::string part = path + ".part";
+  try {
+    write_series(part, entries);
+    complete_file(part, path);
+  } catch (...) {
+    remove_quietly(part);
+    throw;
+  }
+}
+
 }  // namespace
 
 void write_plotfile(const std::string& path, const PlotHeader& header, const PlotFill& fill, MPI_Comm comm) {
@@ -373,7 +386,7 @@ void write_plotfile(const std::string& path, const PlotHeader& header, const Plo
   try {
     write_part(part, header, fill, comm);
     SharedFailure failure;
-    if (rank == 0) failure.attempt(path, "rename the file", [&] { rename_file(part, path); });
+    if (rank == 0) failure.attempt(path, "rename the file", [&] { complete_file(part, path); });
     failure.agree(comm);
   } catch (...) {
     if (rank == 0) remove_quietly(part);
@@ -386,14 +399,13 @@ void append_series(const std::string& series_path, const std::string& file_name,
   const std::string name = json_text(file_name);
   std::erase_if(entries, [&](const SeriesEntry& old) { return old.time >= time_s || old.name == name; });
   entries.push_back({name, time_s});
-  const std::string part = series_path + ".part";
-  try {
-    write_series(part, entries);
-    rename_file(part, series_path);
-  } catch (...) {
-    remove_quietly(part);
-    throw;
-  }
+  replace_series(series_path, entries);
+}
+
+void cut_series(const std::string& series_path, double last_time_s) {
+  std::vector<SeriesEntry> entries = read_series(series_path);
+  const auto later = [&](const SeriesEntry& entry) { return entry.time > last_time_s * (1 + 1e-12); };
+  if (std::erase_if(entries, later) > 0) replace_series(series_path, entries);
 }
 
 }  // namespace dendrift::io

@@ -48,4 +48,7 @@ void write_plotfile(const std::string& path, const PlotHeader&, const PlotFill& 
 /// relative to the list. Not collective: one rank calls it.
 void append_series(const std::string& series_path, const std::string& file_name, double time_s);
 
+/// Leaves out of the list, if there is one, what is later than a restart. Not collective.
+void cut_series(const std::string& series_path, double last_time_s);
+
 }  // namespace dendrift::io

@@ -474,27 +474,8 @@ void Flow::set_viscosity() {
 // difference. Crystals among the arms of others have none.
 void Flow::set_whirls() {
   std::vector<Whirl> whirls;
-  if (options_.coupling == Coupling::coupled && !penalised() && options_.stress == Stress::symmetric && !crystals_.empty()) {
-    constexpr double WIDEST = 4, NARROWEST = 1.1;  // reach over radius
-    const std::vector<double> radii = extents(*mesh_, now_.psi, now_.grain, crystals_);
-    const amr::MeshShape& shape = mesh_->shape();
-    const RealVec lo = shape.lo, hi = shape.hi();
-    const Array<bool> periodic = shape.periodic();
-    for (std::size_t g = 0; g < crystals_.size(); ++g) {
-      if (!(radii[g] > 0)) continue;
-      const RealVec& centre = crystals_[g].position;
-      double reach = WIDEST * radii[g];
-      for (int a = 0; a < DIM; ++a)
-        reach = std::min(reach, periodic[a] ? 0.5 * (hi[a] - lo[a]) : std::min(centre[a] - lo[a], hi[a] - centre[a]));
-      for (std::size_t k = 0; k < crystals_.size(); ++k) {
-        if (k == g || !(radii[k] > 0)) continue;
-        double square = 0;
-        for (const double r : shape.way(centre, crystals_[k].position)) square += r * r;
-        reach = std::min(reach, 0.5 * (std::sqrt(square) + radii[g] - radii[k]));
-      }
-      if (reach > NARROWEST * radii[g]) whirls.push_back({centre, radii[g], reach});
-    }
-  }
+  if (options_.coupling == Coupling::coupled && !penalised() && options_.stress == Stress::symmetric)
+    whirls = find_whirls(*mesh_, now_.psi, now_.grain, crystals_);
   solver_->set_whirls(whirls);
 }
 
@@ -653,11 +634,14 @@ void Flow::balance_crystals(double elapsed) {
                                              wanted > TIGHTEST * tolerance() && result_.iterations < most;
        wanted *= TIGHTER) {
     const int before = result_.iterations;
+    const double unbalanced_before = unbalanced_;
     result_ = solver_->improve(wanted, most - before);
     result_.converged = std::isfinite(result_.error);  // it was before
     result_.iterations += before;
     fastest_ = result_.fastest;
     unbalanced_ = unbalanced();
+    constexpr double HARDLY = 0.9;
+    if (unbalanced_ > HARDLY * unbalanced_before) break;
   }
 }
 

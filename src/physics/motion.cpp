@@ -75,20 +75,8 @@ class Solid {
 
   /// Sets the crystal that the cell at x belongs to, and the way from its centre.
   void find_crystal(const RealVec& x, int b, std::ptrdiff_t cell, Sample& s) const {
-    if (grain_.id >= 0) {
-      s.crystal = static_cast<std::size_t>(mesh_.cells(grain_, b)[cell]);
-      s.r = widened(mesh_.shape().way(crystals_[s.crystal].position, x));
-      return;
-    }
-    double least = 1e300;
-    for (std::size_t g = 0; g < crystals_.size(); ++g) {
-      const Vector3 r = widened(mesh_.shape().way(crystals_[g].position, x));
-      const double square = dot(r, r);
-      if (square >= least) continue;
-      least = square;
-      s.crystal = g;
-      s.r = r;
-    }
+    s.crystal = crystal_of(mesh_, grain_, crystals_, x, b, cell);
+    s.r = widened(mesh_.shape().way(crystals_[s.crystal].position, x));
   }
 
  private:
@@ -108,6 +96,20 @@ Vector3 spin_of(const Vector3& l, const double* inertia) {
 }
 
 }  // namespace
+
+std::size_t crystal_of(const amr::Mesh& mesh, amr::CellField grain, const std::vector<Seed>& crystals, const RealVec& x, int b,
+                       std::ptrdiff_t cell) {
+  if (grain.id >= 0) return static_cast<std::size_t>(mesh.cells(grain, b)[cell]);
+  std::size_t nearest = 0;
+  double least = 1e300;
+  for (std::size_t g = 0; g < crystals.size(); ++g) {
+    const Vector3 r = widened(mesh.shape().way(crystals[g].position, x));
+    if (dot(r, r) >= least) continue;
+    least = dot(r, r);
+    nearest = g;
+  }
+  return nearest;
+}
 
 std::vector<Load> net_loads(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain, const std::vector<Seed>& crystals,
                             const std::function<const double*(int b, int axis)>& force) {
@@ -145,32 +147,6 @@ std::vector<Load> net_loads(const amr::Mesh& mesh, amr::CellField psi, amr::Cell
     std::copy_n(sums.data() + g * WIDTH + DIM, 3, net[g].torque.begin());
   }
   return net;
-}
-
-std::vector<double> extents(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain,
-                            const std::vector<Seed>& crystals) {
-  const amr::Layout& layout = mesh.layout();
-  const Solid solid(mesh, psi, grain, {}, crystals);
-  std::vector<std::vector<double>> parts(at(mesh.size()));
-  amr::parallel_for(mesh.size(), [&](int b) {
-    const amr::Block& block = mesh.block(b);
-    amr::for_each_cell({}, filled(layout.n), [&](const IntVec& q) {
-      constexpr double STIFF = -1;  // from here inwards the viscosity is not that of the melt
-      const std::ptrdiff_t o = layout.offset(q);
-      if (mesh.cells(psi, b)[o] < STIFF) return;
-      RealVec x{};
-      for (int a = 0; a < DIM; ++a) x[a] = block.lo[a] + (q[a] + 0.5) * block.dx;
-      Sample s{};
-      solid.find_crystal(x, b, o, s);
-      parts[at(b)].resize(crystals.size());
-      double& most = parts[at(b)][s.crystal];
-      most = std::max(most, std::sqrt(dot(s.r, s.r)) + block.dx);
-    });
-  });
-  std::vector<double> most(crystals.size());
-  for (const std::vector<double>& part : parts)
-    for (std::size_t k = 0; k < part.size(); ++k) most[k] = std::max(most[k], part[k]);
-  return amr::global_max(std::move(most), mesh.comm());
 }
 
 void measure_motion(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain, amr::FaceField velocity,

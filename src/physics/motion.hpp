@@ -27,8 +27,8 @@ struct Load {
 std::vector<Load> net_loads(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain, const std::vector<Seed>& crystals,
                                 const std::function<const double*(int b, int axis)>& force);
 
-/// Radii about the crystals' centres that hold all that is stiffer than melt; 0 without solid. Collective.
-std::vector<double> extents(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain,
-                            const std::vector<Seed>& crystals);
+/// Whose the cell at x is, cell number `cell` of local block b.
+std::size_t crystal_of(const amr::Mesh& mesh, amr::CellField grain, const std::vector<Seed>& crystals, const RealVec& x, int b,
+                       std::ptrdiff_t cell);
 
 }  // namespace dendrift::physics

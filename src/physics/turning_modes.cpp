@@ -13,30 +13,76 @@ namespace {
 
 std::size_t at(int i) { return static_cast<std::size_t>(i); }
 
-// Rate of rotation at a distance r over that of the solid: h = 1, then a r^-DIM + b, then 0. And g with dg/dr = -h r, 0
-// at the reach, whose curl is the velocity.
-class Profile {
+double square_of(const RealVec& r) {
+  double sum = 0;
+  for (const double x : r) sum += x * x;
+  return sum;
+}
+
+// The stream function g of a whirl, by which the velocity about an axis is curl (g axis): within the hull -r^2/2 and a
+// constant, beyond it that of a disc (sphere) turning in one at rest, of this direction's radius and reach, and what the
+// constant makes too much of it fades smoothly.
+class Stream {
  public:
-  explicit Profile(const Whirl& w) : whirl_(w) {
-    const double inner = std::pow(w.radius, -DIM), outer = std::pow(w.reach, -DIM);
-    a_ = 1 / (inner - outer);
-    b_ = -a_ * outer;
-    at_radius_ = outside(w.radius);
+  struct Value {
+    double g = 0;
+    double beyond = 0;  // distance from the reach, negative inside
+    bool rigid = false;
+  };
+
+  explicit Stream(const Whirl& w) : whirl_(w) {
+    // The rotation drives a flux through the gap between hull and reach, which is the same all round: narrow gaps say how much.
+    double sum = 0, weights = 0;
+    for (std::size_t n = 0; n < w.radius.size(); ++n) {
+      const double weight = w.radius[n] / std::pow(w.reach[n] - w.radius[n], 3);
+      sum += weight * (Gap(w.radius[n], w.reach[n]).stream(w.radius[n]) + 0.5 * w.radius[n] * w.radius[n]);
+      weights += weight;
+    }
+    constant_ = sum / weights;
+    least_radius_ = *std::ranges::min_element(w.radius);
+    largest_reach_ = *std::ranges::max_element(w.reach);
   }
-  double stream(double square) const {
-    if (square >= whirl_.reach * whirl_.reach) return 0;
-    if (square <= whirl_.radius * whirl_.radius) return at_radius_ + 0.5 * (whirl_.radius * whirl_.radius - square);
-    return outside(std::sqrt(square));
+
+  double largest_reach() const { return largest_reach_; }
+
+  Value at(const RealVec& r) const {
+    const double square = square_of(r), distance = std::sqrt(square);
+    if (distance >= largest_reach_ || distance <= least_radius_) return at(distance, square, least_radius_, largest_reach_);
+    return at(distance, square, Directions::value(whirl_.radius, r), Directions::value(whirl_.reach, r));
   }
-  bool rigid(double square) const { return square <= whirl_.radius * whirl_.radius; }
 
  private:
-  double outside(double r) const {
-    const double s = whirl_.reach, rest = 0.5 * b_ * (s * s - r * r);
-    return DIM == 2 ? a_ * std::log(s / r) + rest : a_ * (1 / r - 1 / s) + rest;
+  // Rate of rotation at a distance r over that of the solid: 1, then a r^-DIM + b, then 0.
+  class Gap {
+   public:
+    Gap(double radius, double reach) : reach_(reach) {
+      const double inner = std::pow(radius, -DIM), outer = std::pow(reach, -DIM);
+      a_ = 1 / (inner - outer);
+      b_ = -a_ * outer;
+    }
+    double stream(double r) const {
+      const double rest = 0.5 * b_ * (reach_ * reach_ - r * r);
+      return DIM == 2 ? a_ * std::log(reach_ / r) + rest : a_ * (1 / r - 1 / reach_) + rest;
+    }
+
+   private:
+    double reach_, a_, b_;
+  };
+
+  Value at(double distance, double square, double radius, double reach) const {
+    Value v{0, distance - reach, distance <= radius};
+    if (v.rigid) {
+      v.g = constant_ - 0.5 * square;
+    } else if (v.beyond < 0) {
+      const Gap gap(radius, reach);
+      const double t = (reach - distance) / (reach - radius);
+      v.g = gap.stream(distance) + (constant_ - 0.5 * radius * radius - gap.stream(radius)) * t * t * (3 - 2 * t);
+    }
+    return v;
   }
-  Whirl whirl_;
-  double a_, b_, at_radius_;
+
+  const Whirl& whirl_;
+  double constant_, least_radius_, largest_reach_;
 };
 
 }  // namespace
@@ -46,71 +92,69 @@ void TurningModes::build(const amr::Hierarchy& hierarchy, const std::vector<amr:
   hierarchy_ = &hierarchy;
   const amr::Mesh& mesh = hierarchy.mesh();
   const amr::Layout& layout = mesh.layout();
-  const RealVec lo = mesh.shape().lo, hi = mesh.shape().hi();
-  const Array<bool> periodic = mesh.shape().periodic();
   inverse_.assign(whirls.size(), {});
   turns_.assign(whirls.size(), {});
   faces_.assign(at(mesh.size()), {});
   if (whirls.empty()) return;
+  const std::vector<Stream> streams(whirls.begin(), whirls.end());
   amr::parallel_for(mesh.size(), [&](int b) {
     const auto [g, i] = hierarchy.place_of_block(b);
     const amr::Block& block = mesh.block(b);
-    const double dx = block.dx, half = 0.5 * layout.n * dx;
-    // From the centre of a whirl, or its nearest image.
-    const auto arm = [&](std::size_t w, const RealVec& x) {
-      RealVec r{};
-      for (int a = 0; a < DIM; ++a) {
-        r[a] = x[a] - whirls[w].centre[a];
-        if (periodic[a]) r[a] -= (hi[a] - lo[a]) * std::round(r[a] / (hi[a] - lo[a]));
-      }
-      return r;
+    const double dx = block.dx, margin = 2 * dx;  // K Z reaches beyond Z
+    const double half = 0.5 * layout.n * dx;
+    RealVec middle = block.lo;
+    for (double& x : middle) x += half;
+    // The edges along each axis that a velocity turns about (2D: the corners).
+    struct Near {
+      int whirl;
+      Array<std::vector<Stream::Value>> edges;
     };
-    const auto edge = [&](std::size_t w) { return whirls[w].reach + 2 * dx; };  // K Z reaches beyond Z
-    std::vector<std::size_t> near;
-    std::vector<Profile> profiles;
+    std::vector<Near> near;
     for (std::size_t w = 0; w < whirls.size(); ++w) {
-      RealVec middle{};
-      for (int a = 0; a < DIM; ++a) middle[a] = block.lo[a] + half;
+      const RealVec way = mesh.shape().way(whirls[w].centre, middle);
       double square = 0;
-      for (const double r : arm(w, middle)) square += std::pow(std::max(0.0, std::abs(r) - half), 2);
-      if (square > edge(w) * edge(w)) continue;
-      near.push_back(w);
-      profiles.emplace_back(whirls[w]);
+      for (int a = 0; a < DIM; ++a) square += std::pow(std::max(0.0, std::abs(way[a]) - half), 2);
+      if (square > std::pow(streams[w].largest_reach() + margin, 2)) continue;
+      near.push_back({static_cast<int>(w), {}});
+      for (int k = 0; k < AXES; ++k) {
+        std::vector<Stream::Value>& values = near.back().edges[at(k)];
+        amr::for_each_cell({}, filled(layout.n + 1), [&](const IntVec& q) {
+          RealVec r = way;
+          for (int a = 0; a < DIM; ++a) r[a] += (q[a] + (DIM == 3 && a == k ? 0.5 : 0.0)) * dx - half;
+          values.push_back(streams[w].at(r));
+        });
+      }
     }
     if (near.empty()) return;
+    IntVec to{};  // the next edge along each axis
+    for (int a = 0, s = 1; a < DIM; ++a, s *= layout.n + 1) to[a] = s;
     for (int axis = 0; axis < DIM; ++axis) {
       const amr::Range range = hierarchy.unknowns(g, i, velocities[at(axis)], true);
       amr::for_each_cell(range.lo, range.size, [&](const IntVec& q) {
-        RealVec x{};
-        for (int a = 0; a < DIM; ++a) x[a] = block.lo[a] + (q[a] + (a == axis ? 0.0 : 0.5)) * dx;
-        double least = 0;
-        std::size_t mine = near.size();
-        RealVec r{};
-        for (std::size_t k = 0; k < near.size(); ++k) {
-          const RealVec to = arm(near[k], x);
-          double square = 0;
-          for (const double t : to) square += t * t;
-          const double beyond = std::sqrt(square) - edge(near[k]);
-          if (beyond >= least) continue;
-          least = beyond;
-          mine = k;
-          r = to;
-        }
-        if (mine == near.size()) return;
-        Face f{layout.offset(q), axis, static_cast<int>(near[mine]), std::pow(dx, DIM), {}, {}};
-        const Profile& profile = profiles[mine];
-        double square = 0;
-        for (const double t : r) square += t * t;
+        int edge = 0;
+        for (int a = 0; a < DIM; ++a) edge += q[a] * to[a];
+        double least = margin;
+        Face f{layout.offset(q), axis, -1, std::pow(dx, DIM), {}, {}};
+        const Near* mine = nullptr;
+        for (const Near& n : near)
+          for (int k = 0; k < AXES; ++k) {
+            if (DIM == 3 && k == axis) continue;
+            const double beyond = n.edges[at(k)][at(edge)].beyond;
+            if (beyond >= least) continue;
+            least = beyond;
+            mine = &n;
+          }
+        if (mine == nullptr) return;
+        f.whirl = mine->whirl;
         for (int k = 0; k < AXES; ++k) {
           const int about = DIM == 2 ? 2 : k;
           if (about == axis) continue;
           const int e = 3 - axis - about;  // along it g changes, from one edge of the face to the other
           const double sign = (axis + 1) % 3 == e ? 1 : -1;
-          const double low = r[at(e)] - 0.5 * dx, high = r[at(e)] + 0.5 * dx, rest = square - r[at(e)] * r[at(e)];
-          const bool rigid = profile.rigid(rest + low * low) && profile.rigid(rest + high * high);
-          // To the last digit where nothing may be sheared.
-          const double slope =
-              rigid ? -r[at(e)] : (profile.stream(rest + high * high) - profile.stream(rest + low * low)) / dx;
+          const Stream::Value &low = mine->edges[at(k)][at(edge)], &high = mine->edges[at(k)][at(edge + to[e])];
+          double slope = (high.g - low.g) / dx;
+          if (low.rigid && high.rigid)  // to the last digit where nothing may be sheared
+            slope = -(mesh.shape().way(whirls[at(mine->whirl)].centre, middle)[e] + (q[e] + 0.5) * dx - half);
           f.mode[at(k)] = sign * slope;
         }
         faces_[at(b)].push_back(f);

@@ -6,18 +6,13 @@
 #include <vector>
 
 #include "amr/hierarchy.hpp"
+#include "physics/whirls.hpp"
 
 namespace dendrift::physics {
 
-/// A disc (sphere) that holds all of a solid, and a larger one round it that its rotation may stir. The larger ones of
-/// different solids do not overlap.
-struct Whirl {
-  RealVec centre{};
-  double radius = 0, reach = 0;
-};
-
-/// One velocity Z a whirl and axis, free of divergence: rigid rotation within the radius, and outside the flow round a
-/// turning disc (sphere) inside one at rest. With T, the products with Z, what a force r turns is c = (T K Z)^-1 T r.
+/// One velocity Z a whirl and axis, free of divergence: rigid rotation within the hull, and outside flow that comes to rest at
+/// the reach. With T, the products with Z, what a force r turns is c = (T K Z)^-1 T r. Whirls may overlap; where they do, a face
+/// belongs to the one that reaches farther beyond it.
 class TurningModes {
  public:
   static constexpr int AXES = DIM == 2 ? 1 : 3;

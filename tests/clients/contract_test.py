@@ -19,7 +19,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent / "lib"))
 from support import (Failure, Result, check_result, column, command_line, environment, fail, read_csv, require,
-                     run, say, scratch, snapshot)
+                     reseal, run, say, scratch, snapshot)
 
 # Columns that must stand at the beginning, in this order; more may follow.
 DIAGNOSTICS = ["step", "time_s", "time_tau0", "dt_tau0", "blocks", "cells", "levels", "solid_fraction",
@@ -333,6 +333,7 @@ def check_numerical_failure(folder):
     checkpoint = max((folder / "out").glob("chk_*.h5"))
     with h5py.File(checkpoint, "r+") as file:
         file["fields/c"][7] = math.nan
+    reseal(checkpoint)
     for ranks in (0, 2):
         result = run(scene, "output.dir=out", "--restart", checkpoint, ranks=ranks, code=3, cwd=folder)
         require(len(re.findall(r"not finite at step \d+", result.err)) == 1, f"no cause, or more than one: {result}")
@@ -400,6 +401,7 @@ def check_bad_restarts(folder):
         shutil.copy(good, folder / name)
         with h5py.File(folder / name, "r+") as file:
             change(file)
+        reseal(folder / name)
 
     changed("no_fields.h5", lambda f: f.pop("fields"))
     changed("no_leaves.h5", lambda f: f.pop("leaves"))
@@ -409,7 +411,7 @@ def check_bad_restarts(folder):
     # What each message must say beside the name of the file
     cases = {"missing.h5": "no such file", "missing/folder": "no such file", "run2/plt_0000000.hdf": "not a checkpoint",
              "run2/manifest.json": "open", "garbage.h5": "open", "empty.h5": "open", "cut.h5": "truncated",
-             "nothing_in_it": "no checkpoint", "run3": "2D", "no_fields.h5": "fields",
+             "nothing_in_it": "no checkpoint", "no_fields.h5": "fields",
              "no_leaves.h5": "not a checkpoint", "later_format.h5": "99", "no_next_regrid.h5": "", "bad_leaf.h5": ""}
     (folder / "out").mkdir()
     (folder / "out/plt_0000000.hdf").write_text("an earlier run's\n")
@@ -431,8 +433,10 @@ def check_bad_restarts(folder):
     for name, text in cases.items():
         refused(name, [scenes[2], "--restart", name], text)
     refused("", [scenes[2], "--restart", ""], "", code=(2, 4))  # a script's empty variable is no fresh start
-    for name in ("missing.h5", "run2/plt_0000000.hdf", "garbage.h5", "run3"):
+    for name in ("missing.h5", "run2/plt_0000000.hdf", "garbage.h5"):
         refused(name, [scenes[2], "--restart", name], cases[name], ranks=2)
+    for ranks in (0, 2):
+        refused("run3", [scenes[2], "--restart", "run3"], "mesh.dim", ranks=ranks, code=2)
     # A checkpoint of another box, mesh or number of crystals: the input contradicts the checkpoint
     for words in (["mesh.size_W0=[256, 128]"], ["mesh.root_blocks=[4, 2]"], ["mesh.levels=3"], ["mesh.block_cells=16"],
                   ["mesh.xlo=periodic", "mesh.xhi=periodic"], ["seed[1].position_W0=[90, 40]", "seed[1].radius_W0=5"]):

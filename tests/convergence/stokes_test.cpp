@@ -305,7 +305,7 @@ TEST(Stokes, WrongSpinOfAFirstGuess) {
                   [&](const IntVec& q) { phi[mesh.layout().offset(q)] = disc.phi(place(mesh.block(b), q, -1)); });
         },
         [](double phi) { return physics::relative_viscosity(physics::ViscosityLaw::h3, 1e6, phi); });
-    if (whirl) solver.set_whirls({{disc.centre, radius + 4, 3.5 * radius}});
+    if (whirl) solver.set_whirls({physics::Whirl::round(disc.centre, radius + 4, 3.5 * radius)});
     double moment = 0;  // of r^2 over the core
     const auto arm = [&](int a, const RealVec& x) {
       return disc.phi(x) < 0.9 ? 0.0 : a == 0 ? -(x[1] - centre) : a == 1 ? x[0] - centre : 0.0;

@@ -9,6 +9,8 @@
 #include <fstream>
 #include <sstream>
 
+#include "io/hdf5.hpp"
+
 namespace dendrift::test {
 namespace {
 
@@ -43,6 +45,16 @@ TEST_F(CsvRestart, SetsOtherColumnsAside) {
     EXPECT_EQ(read(), "n,t\n5,0.25\n");
     EXPECT_EQ(read(name), "t,n\n0.1,1\n");
   }
+}
+
+TEST_F(CsvRestart, NoticesThatTheFileIsGone) {
+  io::CsvFile file(path(), "n,t");
+  file.line({1, 2});
+  std::filesystem::rename(path(), path("moved.csv"));
+  EXPECT_THROW(file.line({3, 4}), io::OutputError);
+  write("n,t\n");  // another file of that name
+  EXPECT_THROW(file.line({3, 4}), io::OutputError);
+  EXPECT_EQ(read("moved.csv"), "n,t\n1,2\n");
 }
 
 TEST_F(CsvRestart, NothingBefore) {
