@@ -402,7 +402,8 @@ def scripts(bench, log, mails):
         "no_progress": bench.submit("until_done", small, input=scene, output=out["no_progress"],
                                     overrides=["run.wall_clock_limit_s=1e-6"]),
         "two_tries": bench.submit("until_done", small, input=scene, output=out["two_tries"], max_tries=2,
-                                  overrides=["run.wall_clock_limit_s=1", "run.max_steps=10000000"])}
+                                  overrides=["run.max_steps=10000000"])}
+    limits.append(Limits(bench, stopped["two_tries"], out["two_tries"], [50, 400]))
     strong = bench.submit("strong_scaling", "--nodes=1 --ntasks-per-node=4 --array=1,2,4,5%1 --time=30", input=scene,
                           output=out["strong"], overrides=["run.max_steps=60"], repeats=2)
     weak = bench.submit("weak_scaling", "--nodes=2 --ntasks-per-node=2 --array=1,4,2%1 --time=30", input=scene,
