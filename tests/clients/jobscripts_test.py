@@ -39,7 +39,7 @@ def check_text(path):
         found = re.match(r"#SBATCH --([\w-]+)(?:=(\S+))?(?:\s+# .*)?$", line)
         require(found, f"{path.name}:{number}: '{line}' is not an option")
         name, value = found.groups()
-        require(name in (WITH_VALUE if value else WITHOUT), f"{path.name}:{number}: sbatch does not know --{name}={value}")
+        require(name in (WITH_VALUE if value else WITHOUT), f"{path.name}:{number}: unknown option --{name}={value}")
         require(name not in VALUES or re.fullmatch(VALUES[name], value), f"{path.name}:{number}: --{name}={value}")
         require(name not in options, f"{path.name}:{number}: --{name} twice")
         options[name] = value
@@ -68,13 +68,13 @@ read -r code step manifest <<<"$(sed -n "${n}p" "$WORK/plan.txt")"
 echo "{\\"status\\": \\"$manifest\\"}" >"$out/manifest.json"
 exit "$code"
 """,
-    "scontrol": '#!/usr/bin/env bash\necho "$@" >>"$WORK/scontrol.txt"\n',
+    "scontrol": '#!/usr/bin/env bash\n[ ! -e "$WORK/forbidden" ] || exit 1\necho "$@" >>"$WORK/scontrol.txt"\n',
     "mail": '#!/usr/bin/env bash\n(echo "$@"; cat) >>"$WORK/mail.txt"\n'}
 
 
 def go(folder, name, plan, edits=(), array=None):
     """Runs a script as often as it asks for, `plan` saying the exit code, new checkpoint and status of each start of the
-    program. Gives exit codes of the script and the words of each srun."""
+    program. Gives exit codes of the script, the words of each srun and what the last start printed."""
     for program, text in STAND_INS.items():
         (folder / program).write_text(text)
         (folder / program).chmod(0o755)
@@ -119,6 +119,10 @@ def check_requeue(name, array=None):
     tries = re.search(r"^max_tries=\d+", (SOURCE / f"jobscripts/{name}.sbatch").read_text(), re.M)[0]
     codes, _, _ = go(scratch(), name, [(75, n, "stopped") for n in range(9)], [(tries, "max_tries=3")], array)
     require(codes == [75] * 3, f"{name}: max_tries=3 gives {codes}")
+    folder = scratch()
+    (folder / "forbidden").touch()
+    codes, _, text = go(folder, name, [(75, 5, "stopped")], array=array)
+    require(codes == [75] and "could not be queued again" in text, f"{name}, no requeue: {codes} {text}")
 
 
 def check_until_done():
