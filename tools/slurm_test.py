@@ -322,13 +322,13 @@ def newest(folder):
 
 
 def contents(path):
-    """Everything numerical in an HDF5 file, as bytes; not the text of the input, which names folders, nor which rank
+    """Everything numerical in an HDF5 file, as bytes; not the texts that name folders and ranks, nor which rank
     had which block (the array of all components of a plotfile has it, too: its VTKHDF face names them one by one)."""
     found = {}
 
     def visit(name, item):
         ranks = name.rpartition("/")[2] in ("rank", "Processors", "data:datatype=0")
-        if isinstance(item, h5py.Dataset) and not ranks and name != "input" and item.dtype.kind in "iufV":
+        if isinstance(item, h5py.Dataset) and not ranks and name not in ("input", "origin") and item.dtype.kind in "iufV":
             found[name] = (item.shape, str(item.dtype), item[()].tobytes())
 
     with h5py.File(path) as file:

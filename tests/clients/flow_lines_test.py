@@ -11,7 +11,7 @@ from support import column, read_csv, require, run, say, scratch
 SCENE = """
 [run]
 end_time_tau0 = 1000
-max_steps = 60
+max_steps = 126
 [mesh]
 dim = 2
 size_W0 = [64, 64]
