@@ -37,7 +37,7 @@ SCRIPTS = ROOT / "jobscripts"
 NODES = ("n1", "n2", "n3")
 CPUS = 8              # pretended, of each node
 REQUEUE_WAIT = 6      # s until Slurm starts a requeued job again; 120 by default (slurm.conf, cred_expire)
-STEPS = 1200          # of the runs below
+STEPS = 2000          # of the runs below
 GROWTH = """
 [run]
 end_time_tau0 = 100000
@@ -275,32 +275,34 @@ class Bench:
     def wait(self, *jobs, seconds=400, meanwhile=lambda: None):
         end = time.monotonic() + seconds
         while True:
-            meanwhile()
             found = [self.ended(job) for job in jobs]
             if all(found):
                 return [j for group in found for j in group]
             if time.monotonic() > end:
                 raise RuntimeError(f"jobs {' '.join(jobs)} did not end in {seconds} s: {ask('squeue')}")
-            time.sleep(0.3)
+            for _ in range(20):
+                meanwhile()
+                time.sleep(0.05)
 
     def log_of(self, job):
         return "".join(p.read_text() for p in sorted(self.folder.glob(f"*_{job}.log")))
 
 
 class Limits:
-    """Sends SIGUSR1 to the steps of a job each time its run has done as many steps as the next of a list."""
+    """Sends SIGUSR1 to the steps of a job once in each of its first starts, when its run has done as many steps as the
+    list says and some since the start: without them it would stop where it began."""
 
     def __init__(self, bench, job, output, steps):
         self.bench, self.job, self.output, self.steps, self.sent = bench, job, output, list(steps), []
 
     def __call__(self):
-        done = last_step(self.output)
-        if self.steps and done >= self.steps[0] and self.bench.state(self.job)[0]["JobState"] == "RUNNING":
-            if manifest(self.output).get("status") == "running":
+        number, done = len(self.sent), last_step(self.output)
+        if number < len(self.steps) and done >= self.steps[number] and done > step_of(newest(self.output)):
+            state = self.bench.state(self.job)[0]
+            if (state["JobState"], int(state["Restarts"])) == ("RUNNING", number) and \
+                    manifest(self.output).get("status") == "running":
                 ask("scancel", "--signal=USR1", self.job)
                 self.sent.append(done)
-                while self.steps and self.steps[0] <= done:
-                    self.steps.pop(0)
 
 
 def manifest(folder):
@@ -321,14 +323,18 @@ def newest(folder):
     return max((p.name for p in folder.glob("chk_*.h5")), default="none")
 
 
+def step_of(checkpoint):
+    return -1 if checkpoint == "none" else int(re.search(r"\d+", checkpoint)[0])
+
+
 def contents(path):
     """Everything numerical in an HDF5 file, as bytes; not the texts that name folders and ranks, nor which rank
     had which block (the array of all components of a plotfile has it, too: its VTKHDF face names them one by one)."""
     found = {}
 
     def visit(name, item):
-        ranks = name.rpartition("/")[2] in ("rank", "Processors", "data:datatype=0")
-        if isinstance(item, h5py.Dataset) and not ranks and name not in ("input", "origin") and item.dtype.kind in "iufV":
+        other = name.rpartition("/")[2] in ("rank", "Processors", "data:datatype=0", "input", "origin")
+        if isinstance(item, h5py.Dataset) and not other and item.dtype.kind in "iufV":
             found[name] = (item.shape, str(item.dtype), item[()].tobytes())
 
     with h5py.File(path) as file:
@@ -390,8 +396,8 @@ def scripts(bench, log, mails):
                                 "alloy.supersaturation=25"])
     many = bench.submit("many_node", "--nodes=2 --ntasks-per-node=2 --cpus-per-task=2 --time=30", input=scene,
                         output=out["many_node"])
-    limits = [Limits(bench, until, out["until_done"], [STEPS * k // 5 for k in (1, 2, 3)]),
-              Limits(bench, many, out["many_node"], [STEPS // 2])]
+    limits = [Limits(bench, until, out["until_done"], [STEPS * k // 8 for k in (1, 2, 3)]),
+              Limits(bench, many, out["many_node"], [STEPS // 4])]
     (out["code_4"] / "diagnostics.csv").mkdir(parents=True)  # a folder in the place of a file
     stopped = {
         "code_2": bench.submit("until_done", small, input=scene, output=out["code_2"],
@@ -482,9 +488,8 @@ def slurms_own_limit(bench, log):
     end = []
 
     def set_the_end():
-        state = bench.state(job)[0]
-        if not end and int(state["Restarts"]) >= 3:
-            end.append(int(re.search(r"\d+", newest(output))[0]) + 50)
+        if not end and int(bench.state(job)[0]["Restarts"]) >= 3:
+            end.append(step_of(newest(output)) + 50)
             bench.scene("settling", SETTLING, end[0])
 
     found, = bench.wait(job, seconds=900, meanwhile=set_the_end)
@@ -528,8 +533,8 @@ def failing_node(bench, slurm, log):
     node = []
 
     def take_it_down():
-        state = bench.state(job)[0]
-        if not node and state["JobState"] == "RUNNING" and last_step(output) >= STEPS // 2:
+        if not node and last_step(output) >= STEPS // 4 and newest(output) != "none":
+            state = bench.state(job)[0]
             node.extend([state["NodeList"], kill_everything(slurm, job, state["NodeList"]), newest(output)])
             ask("scontrol", "update", f"nodename={node[0]}", "state=down", "reason=test")  # instead of its timeout
 
