@@ -3,6 +3,7 @@
 #   tools/setup_debian.sh run    what run.sh needs: to build, run and draw
 #   tools/setup_debian.sh test   that and what the tests and benchmarks need
 #   tools/setup_debian.sh tsan   that and clang with its OpenMP runtime, for ./test.sh tsan
+#   tools/setup_debian.sh slurm  the queue that tools/slurm_test.py starts, which ./test.sh does not need
 # As root it calls apt-get; otherwise it prints the command for root and exits with 1.
 set -euo pipefail
 
@@ -14,13 +15,15 @@ run_packages=(
 )
 test_packages=(libgtest-dev libgmock-dev libbenchmark-dev python3-yt)
 tsan_packages=(clang libomp-dev)
+slurm_packages=(slurm-wlm munge)
 
 group="${1:-run}"
 case "$group" in
   run) wanted=("${run_packages[@]}") ;;
   test) wanted=("${run_packages[@]}" "${test_packages[@]}") ;;
   tsan) wanted=("${run_packages[@]}" "${test_packages[@]}" "${tsan_packages[@]}") ;;
-  *) echo "setup: expected run, test or tsan, found '$group'" >&2; exit 2 ;;
+  slurm) wanted=("${slurm_packages[@]}") ;;
+  *) echo "setup: expected run, test, tsan or slurm, found '$group'" >&2; exit 2 ;;
 esac
 
 if ! command -v dpkg-query >/dev/null || ! command -v apt-get >/dev/null; then

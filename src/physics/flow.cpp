@@ -356,7 +356,10 @@ void Flow::choose_mesh() {
   ghosts_ = coarser_ghosts_.get();
 }
 
-std::vector<double> Flow::memory() const { return {last_, next_, interval_, fastest_, due_ ? 1.0 : 0.0}; }
+std::vector<double> Flow::memory() const {
+  return {last_, next_, interval_, fastest_, due_ ? 1.0 : 0.0, result_.divergence_max,
+          static_cast<double>(result_.iterations), unbalanced_};
+}
 
 void Flow::recall(const std::vector<double>& m) {
   last_ = m.at(0);
@@ -364,6 +367,11 @@ void Flow::recall(const std::vector<double>& m) {
   interval_ = m.at(2);
   fastest_ = m.at(3);
   due_ = m.at(4) != 0;
+  if (m.size() > 5) {  // what diagnostics.csv says until the next solution; older checkpoints lack it
+    result_.divergence_max = m.at(5);
+    result_.iterations = static_cast<int>(m.at(6));
+    unbalanced_ = m.at(7);
+  }
   recalled_ = true;
 }
 
