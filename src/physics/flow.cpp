@@ -27,6 +27,12 @@ RealVec centre_of(const amr::MeshShape& shape) {
 
 double of_gradient(const Gradient& g, int component, int along) { return g[at(component * DIM + along)]; }
 
+// r x f; in 2D the last component.
+std::array<double, 3> moment_of(const RealVec& r, const RealVec& f) {
+  if constexpr (DIM == 2) return {0, 0, r[0] * f[1] - r[1] * f[0]};
+  return {r[1] * f[2] - r[2] * f[1], r[2] * f[0] - r[0] * f[2], r[0] * f[1] - r[1] * f[0]};
+}
+
 amr::FieldSpec velocity_field() {
   amr::FieldSpec f;
   f.name = "velocity";
@@ -487,10 +493,9 @@ void Flow::set_viscosity() {
 // Round each crystal that may turn: as far as walls and half the gaps to others let it, and no further than what makes a
 // difference. Crystals among the arms of others have none.
 void Flow::set_whirls() {
-  std::vector<Whirl> whirls;
-  if (options_.coupling == Coupling::coupled && !penalised() && options_.stress == Stress::symmetric)
-    whirls = find_whirls(*mesh_, now_.psi, now_.grain, crystals_);
-  solver_->set_whirls(whirls);
+  neighbourhood_ = find_neighbourhood(*mesh_, now_.psi, now_.grain, crystals_);
+  const bool turning = options_.coupling == Coupling::coupled && !penalised() && options_.stress == Stress::symmetric;
+  solver_->set_whirls(turning ? neighbourhood_.whirls : std::vector<Whirl>());
 }
 
 // Eqs. (5) and (6): what is known of the momentum at the end of the interval.
@@ -612,23 +617,46 @@ void Flow::shift(amr::HierarchyField& f, const RealVec& by, const Array<bool>& a
   });
 }
 
-// The true residual, in the norms that tell how wrong crystals move: of each that is free the error of its velocity, and of
-// its spin times its radius, for the drag of a disc (2D, without the logarithm) or a sphere of its size; over the largest speed.
+// The true residual, in the norms that tell how wrong crystals move: of each that is free, with those that it is frozen to, the
+// error of its velocity, and of its spin times its radius, for the drag of a disc (2D, without the logarithm) or a sphere of
+// that size; over the largest speed.
 double Flow::unbalanced() const {
   if (!(fastest_ > 0)) return 0;
   const std::vector<Load> loads = net_loads(*mesh_, now_.psi, now_.grain, crystals_, [&](int b, int axis) {
     const auto [g, i] = solver_->hierarchy().place_of_block(b);
     return solver_->residual().at(g, i, axis);
   });
-  double most = 0;
+  struct Body {
+    double volume = 0;
+    RealVec moment{};  // of volume about the first crystal's centre, as the torque
+    Load load;
+  };
+  std::vector<Body> bodies(crystals_.size());
   for (std::size_t g = 0; g < crystals_.size(); ++g) {
-    if (!(crystals_[g].volume > 0) || held(crystals_[g])) continue;
-    const double radius = DIM == 2 ? std::sqrt(crystals_[g].volume / std::numbers::pi) : std::cbrt(0.75 / std::numbers::pi * crystals_[g].volume);
+    const int first = neighbourhood_.body[g];
+    if (!(crystals_[g].volume > 0) || held(crystals_[g]) || first == Neighbourhood::FIXED) continue;
+    Body& body = bodies[at(first)];
+    const RealVec r = mesh_->shape().way(crystals_[at(first)].position, crystals_[g].position);
+    const std::array<double, 3> lever = moment_of(r, loads[g].force);
+    body.volume += crystals_[g].volume;
+    for (int a = 0; a < DIM; ++a) {
+      body.moment[a] += crystals_[g].volume * r[a];
+      body.load.force[a] += loads[g].force[a];
+    }
+    for (std::size_t a = 0; a < 3; ++a) body.load.torque[a] += loads[g].torque[a] + lever[a];
+  }
+  double most = 0;
+  for (const Body& body : bodies) {
+    if (!(body.volume > 0)) continue;
+    RealVec centre = body.moment;
+    for (double& x : centre) x /= body.volume;
+    const std::array<double, 3> lever = moment_of(centre, body.load.force);
+    const double radius = DIM == 2 ? std::sqrt(body.volume / std::numbers::pi) : std::cbrt(0.75 / std::numbers::pi * body.volume);
     const double drag = DIM == 2 ? 4 * std::numbers::pi : 6 * std::numbers::pi * radius;
     const double turning = DIM == 2 ? 4 * std::numbers::pi * radius : 8 * std::numbers::pi * radius * radius;  // torque per speed of the surface
     double force = 0, torque = 0;
-    for (const double f : loads[g].force) force += f * f;
-    for (const double m : loads[g].torque) torque += m * m;
+    for (const double f : body.load.force) force += f * f;
+    for (std::size_t a = 0; a < 3; ++a) torque += std::pow(body.load.torque[a] - lever[a], 2);
     // A torque tells the error of the spin to the percent. A force overstates that of the velocity twenty times: the melt around
     // is left with one to the other side.
     constexpr double OF_FORCE = 0.1;

@@ -144,6 +144,7 @@ class Flow : public Module {
   RealVec means(const amr::HierarchyField& f) const;
   void shift(amr::HierarchyField& f, const RealVec& by, const Array<bool>& axes);
 
+  Neighbourhood neighbourhood_;  // at the last solution
   FlowOptions options_;
   Scales scales_;
   std::vector<Seed>& crystals_;

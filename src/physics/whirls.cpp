@@ -1,6 +1,7 @@
 #include "physics/whirls.hpp"
 
 #include <algorithm>
+#include <atomic>
 #include <cmath>
 #include <map>
 
@@ -129,6 +130,23 @@ double way_out(const amr::MeshShape& shape, const RealVec& from, const RealVec& 
   return least;
 }
 
+// The least number of each crystal's group; links[g * count + k]: g and k belong together. Fixed are those linked to one.
+std::vector<int> groups(const std::vector<double>& links, const std::vector<bool>& fixed) {
+  const std::size_t count = fixed.size();
+  std::vector<int> group(count);
+  for (std::size_t g = 0; g < count; ++g) group[g] = fixed[g] ? Neighbourhood::FIXED : static_cast<int>(g);
+  for (bool changed = true; changed;) {
+    changed = false;
+    for (std::size_t g = 0; g < count; ++g)
+      for (std::size_t k = 0; k < count; ++k) {
+        if (links[g * count + k] == 0 || group[g] == group[k]) continue;
+        group[g] = group[k] = std::min(group[g], group[k]);
+        changed = true;
+      }
+  }
+  return group;
+}
+
 // To the plane half way to another crystal, a distance D away, whose farthest solid is not this one's.
 double half_way(const RealVec& to_other, double own, double others, const RealVec& direction) {
   const double distance = length(to_other);
@@ -160,7 +178,7 @@ Whirl Whirl::round(const RealVec& centre, double radius, double reach) {
   return {centre, std::vector<double>(n, radius), std::vector<double>(n, reach)};
 }
 
-std::vector<Whirl> find_whirls(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain, const std::vector<Seed>& crystals) {
+Neighbourhood find_neighbourhood(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain, const std::vector<Seed>& crystals) {
   if (crystals.empty()) return {};
   const amr::MeshShape& shape = mesh.shape();
   const std::size_t width = Directions::nodes().size();
@@ -174,14 +192,24 @@ std::vector<Whirl> find_whirls(const amr::Mesh& mesh, amr::CellField psi, amr::C
     for (std::size_t n = 0; n < width; ++n) all[g].radius[n] = std::max(0.0, -inside[g * width + n]);
     largest[g] = *std::ranges::max_element(all[g].radius);
   }
+  // Where a hull, which lies a cell or so outside its solid, holds some of another crystal, both are one.
+  std::vector<std::atomic<char>> touching(crystals.size() * crystals.size());
   const std::vector<double> others = seen(mesh, psi, grain, crystals, [&](const amr::Block& block, const RealVec& x, std::size_t own, Least& least) {
     for (std::size_t g = 0; g < crystals.size(); ++g) {
       if (g == own || largest[g] == 0) continue;
       const RealVec r = shape.way(crystals[g].position, x);
       if (length(r) < 2 * WIDEST * largest[g]) stamp(r, block.dx, least[g], [](double distance) { return distance; });
+      if (length(r) > 0 && length(r) < Directions::value(all[g].radius, r)) touching[g * crystals.size() + own] = 1;
     }
   });
-  std::vector<Whirl> whirls;
+  std::vector<double> links(touching.begin(), touching.end());
+  links = amr::global_max(std::move(links), mesh.comm());
+  std::vector<bool> fixed(crystals.size(), false);
+  for (std::size_t g = 0; g < crystals.size(); ++g)
+    for (std::size_t n = 0; n < width && largest[g] > 0; ++n)
+      if (all[g].radius[n] > way_out(shape, crystals[g].position, Directions::nodes()[n])) fixed[g] = true;
+  Neighbourhood found;
+  found.body = groups(links, fixed);
   const double gap = NARROWEST * shape.dx(shape.max_level);
   for (std::size_t g = 0; g < crystals.size(); ++g) {
     if (largest[g] == 0) continue;
@@ -199,9 +227,9 @@ std::vector<Whirl> find_whirls(const amr::Mesh& mesh, amr::CellField psi, amr::C
     smooth(w.radius, 1);
     smooth(w.reach, -1);
     for (std::size_t n = 0; n < width; ++n) w.reach[n] = std::max(w.reach[n], w.radius[n] + gap);
-    whirls.push_back(std::move(w));
+    found.whirls.push_back(std::move(w));
   }
-  return whirls;
+  return found;
 }
 
 }  // namespace dendrift::physics

@@ -28,10 +28,18 @@ struct Whirl {
   static Whirl round(const RealVec& centre, double radius, double reach);
 };
 
-/// Those of all crystals: the hull holds what is stiffer than melt, as a circle (sphere) where others leave room, and melt is
-/// stirred half way to the next crystal, to a wall, or as far as four radii. `grain`: whose a cell is; without it (id -1) that of the nearest centre.
-/// Collective, the same on any ranks.
-std::vector<Whirl> find_whirls(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain, const std::vector<Seed>& crystals);
+/// How crystals stand to each other and to the walls.
+struct Neighbourhood {
+  /// Of all crystals that are there: the hull holds what is stiffer than melt, as a circle (sphere) where others leave room,
+  /// and melt is stirred half way to the next crystal, to a wall, or as far as four radii.
+  std::vector<Whirl> whirls;
+  /// Of each crystal: the first of those that it is frozen to, directly or through others, and itself; or FIXED, to a wall.
+  std::vector<int> body;
+  static constexpr int FIXED = -1;
+};
+
+/// `grain`: whose a cell is; without it (id -1) that of the nearest centre. Collective, the same on any ranks.
+Neighbourhood find_neighbourhood(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain, const std::vector<Seed>& crystals);
 
 // Implementation
 

@@ -62,7 +62,9 @@ TEST(Whirls, HoldTheSolidAndShareTheMelt) {
   }
   Scene scene(text);
   amr::Mesh& mesh = scene->mesh();
-  const std::vector<physics::Whirl> whirls = physics::find_whirls(mesh, scene->field("psi"), {-1}, scene->crystals());
+  const physics::Neighbourhood found = physics::find_neighbourhood(mesh, scene->field("psi"), {-1}, scene->crystals());
+  const std::vector<physics::Whirl>& whirls = found.whirls;
+  EXPECT_EQ(found.body, (std::vector<int>{0, 1}));
   ASSERT_EQ(whirls.size(), 2u);
   const std::vector<RealVec>& nodes = physics::Directions::nodes();
   for (const physics::Whirl& w : whirls) {
@@ -81,6 +83,18 @@ TEST(Whirls, HoldTheSolidAndShareTheMelt) {
       }
     }
   }
+}
+
+// Numbers 0 and 2 are frozen together, 3 to a wall, 4 to 3, and 1 stands 4 W0 from 0.
+TEST(Neighbourhood, KnowsWhatIsFrozenTogether) {
+  std::string text = fmt::format("[run]\nend_time_tau0 = 1\n[mesh]\ndim = {}\nsize_W0 = {}\ndx_W0 = 1\n[phase_field]\nfrozen = true\n", DIM,
+                                 vector_text(64));
+  for (const auto& [x, y] : {std::pair{20.0, 40.0}, {40.0, 40.0}, {20.0, 25.0}, {57.0, 20.0}, {43.0, 20.0}}) {
+    text += fmt::format("[[seed]]\nposition_W0 = [{}, {}{}]\nradius_W0 = 8\n", x, y, DIM == 3 ? ", 32" : "");
+  }
+  Scene scene(text);
+  const physics::Neighbourhood found = physics::find_neighbourhood(scene->mesh(), scene->field("psi"), {-1}, scene->crystals());
+  EXPECT_EQ(found.body, (std::vector<int>{0, 1, 0, -1, -1}));
 }
 
 }  // namespace
