@@ -36,7 +36,7 @@ std::string place_text(const amr::Mesh& mesh, int b, const IntVec& cell) {
   return text;
 }
 
-// Values in the plane through the cell, two cells to each side, ghosts included; then what the block holds.
+// Values in the plane through the cell, two cells to each side within the block; then what the block holds.
 std::string around(const amr::Mesh& mesh, amr::CellField psi, amr::CellField c, int b, const IntVec& cell) {
   const amr::Layout& layout = mesh.layout();
   const amr::Block& block = mesh.block(b);
@@ -47,8 +47,12 @@ std::string around(const amr::Mesh& mesh, amr::CellField psi, amr::CellField c, 
   for (int j = REACH; j >= -REACH; --j) {
     for (int i = -REACH; i <= REACH; ++i) {
       IntVec q = cell;
-      q[0] = std::clamp(cell[0] + i, -amr::Layout::GHOSTS, layout.n + amr::Layout::GHOSTS - 1);
-      q[1] = std::clamp(cell[1] + j, -amr::Layout::GHOSTS, layout.n + amr::Layout::GHOSTS - 1);
+      q[0] += i;
+      q[1] += j;
+      if (std::min(q[0], q[1]) < 0 || std::max(q[0], q[1]) >= layout.n) {
+        text += fmt::format("{:20}", "-");
+        continue;
+      }
       const std::ptrdiff_t o = layout.offset(q);
       text += fmt::format("  {:7.4f},{:10.4g}", physics::phi_of_psi(mesh.cells(psi, b)[o]), mesh.cells(c, b)[o]);
     }
@@ -84,7 +88,8 @@ void GuardOptions::declare(io::Schema& schema) {
   t.real("min_dt_tau0", min_dt_tau0).unit("tau0").above(0).doc("a step below is a failure");
 }
 
-std::optional<std::string> find_fault(const amr::Mesh& mesh, amr::CellField psi, amr::CellField c, double max_c) {
+std::optional<std::string> find_fault(const amr::Mesh& mesh, amr::CellField psi, amr::CellField c, double max_c,
+                                      const std::string& when) {
   const amr::Layout& layout = mesh.layout();
   std::vector<char> sick(static_cast<std::size_t>(mesh.size()), 0);
   amr::parallel_for(mesh.size(), [&](int b) {
@@ -108,8 +113,8 @@ std::optional<std::string> find_fault(const amr::Mesh& mesh, amr::CellField psi,
       const double p = mesh.cells(psi, b)[o], u = mesh.cells(c, b)[o];
       if (found || Bounds{max_c}.hold(p, u)) return;
       found = true;
-      text = fmt::format("{} at ({}) W0: phi = {:.6g}, c/c_l = {:.6g}\n{}", std::isfinite(p) && std::isfinite(u) ? "c is out of bounds" : "phi or c is not finite",
-                         place_text(mesh, b, q), physics::phi_of_psi(p), u, around(mesh, psi, c, b, q));
+      text = fmt::format("{} {}, at ({}) W0: phi = {:.6g}, c/c_l = {:.6g}\n{}",
+                         std::isfinite(p) && std::isfinite(u) ? "c is out of bounds" : "phi or c is not finite", when, place_text(mesh, b, q), physics::phi_of_psi(p), u, around(mesh, psi, c, b, q));
     });
   }
   const std::vector<char> all = amr::all_gather(std::span<const char>(text.data(), text.size()), mesh.comm());

@@ -22,8 +22,9 @@ struct GuardOptions {
 };
 
 /// What is wrong with phi and c on any rank: the first block (by leaf) with a cell that is not finite or where c/c_l is not
-/// within -.1 and `max_c`, that cell, and the cells and blocks around it. The same text on all ranks. Collective.
-std::optional<std::string> find_fault(const amr::Mesh& mesh, amr::CellField psi, amr::CellField c, double max_c);
+/// within -.1 and `max_c`, `when`, that cell, and the cells and blocks around it. The same text on all ranks. Collective.
+std::optional<std::string> find_fault(const amr::Mesh& mesh, amr::CellField psi, amr::CellField c, double max_c,
+                                      const std::string& when);
 
 /// How much smaller steps are than they might be, after failures.
 class Caution {

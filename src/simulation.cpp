@@ -253,23 +253,28 @@ Outcome Simulation::run() {
       }
     }
   } catch (const NumericalError& e) {
-    std::string message = e.what();
-    try {
-      write_checkpoint(path(fmt::format("failed_{:07d}.h5", step_)));  // beside the good ones, not among them
-    } catch (const io::OutputError& not_saved) {
-      message += fmt::format("; the state is lost: {}", not_saved.what());
-    }
+    throw NumericalError(leave_behind(e.what()));
+  } catch (const io::OutputError& e) {
+    record_failure(manifest("failed", clock_.seconds()), exit_code::output_failure, e.what());
+    throw;
+  }
+}
+
+// The bad state beside the good checkpoints, the last good one among them, and the manifest. Returns what to say.
+std::string Simulation::leave_behind(std::string message) {
+  const io::Manifest failed = manifest("failed", clock_.seconds());
+  try {
+    write_checkpoint(path(fmt::format("failed_{:07d}.h5", step_)));
     if (!snapshot_.empty()) {
       restore();
       save();
       message += fmt::format("\nthe last good state, of step {}, is in {}", step_, checkpoint_name());
     }
-    record_failure(exit_code::numerical_failure, message);
-    throw NumericalError(message);
-  } catch (const io::OutputError& e) {
-    record_failure(exit_code::output_failure, e.what());
-    throw;
+  } catch (const io::OutputError& not_saved) {
+    message += fmt::format("; a state is lost: {}", not_saved.what());
   }
+  record_failure(failed, exit_code::numerical_failure, message);
+  return message;
 }
 
 std::optional<Outcome> Simulation::iterate() {
@@ -336,13 +341,14 @@ std::optional<Outcome> Simulation::iterate() {
 void Simulation::keep_snapshot() {
   const int every = settings_.guard.snapshot_every_steps;
   if (every == 0 || (!snapshot_.empty() && !written_ && step_ < snapshot_.state().step + every)) return;
+  if (snapshot_.empty()) check_state();  // what a run starts from may be bad already
   snapshot_.take(*mesh_, state());
   written_ = false;
 }
 
 void Simulation::check_state() const {
-  if (const auto fault = find_fault(*mesh_, psi_, c_, settings_.guard.max_c))
-    throw NumericalError(fmt::format("step {}, t = {:.6g} tau0: {}", step_, time_, *fault));
+  const std::string when = fmt::format("at step {}, t = {:.6g} tau0", step_, time_);
+  if (const auto fault = find_fault(*mesh_, psi_, c_, settings_.guard.max_c, when)) throw NumericalError(*fault);
 }
 
 void Simulation::go_back() {
@@ -732,10 +738,9 @@ void Simulation::write_manifest(const std::string& status, std::optional<int> ex
   failure.agree(comm_);
 }
 
-void Simulation::record_failure(int exit_code, const std::string& message) const {
+void Simulation::record_failure(io::Manifest m, int exit_code, const std::string& message) const {
   if (mesh_->rank() != 0) return;  // no messages between ranks once something has failed: times are those of this rank
   try {
-    io::Manifest m = manifest("failed", clock_.seconds());
     m.exit_code = exit_code;
     m.message = message;
     io::write_manifest(path("manifest.json"), m);

@@ -129,7 +129,8 @@ class Simulation {
   void save();
   io::Manifest manifest(const std::string& status, const std::map<std::string, double>& phases) const;
   void write_manifest(const std::string& status, std::optional<int> exit_code = std::nullopt);
-  void record_failure(int exit_code, const std::string& message) const;  // not collective, throws nothing of its own
+  std::string leave_behind(std::string message);  ///< after a failure; returns the message, longer by what was saved
+  void record_failure(io::Manifest m, int exit_code, const std::string& message) const;  // not collective, throws nothing of its own
   void progress(const Totals& t, double dt, bool last);
   std::string plot_name() const;
   std::string checkpoint_name() const;

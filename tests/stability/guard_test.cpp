@@ -129,7 +129,7 @@ TEST_F(Guard, GivesUpWithTheCauseAndLosesNothing) {
       ADD_FAILURE() << "went on";
     } catch (const NumericalError& e) {
       const std::string message = e.what();
-      for (const char* part : {"phi or c is not finite at (", "block on level", "the last good state", "nan"})
+      for (const char* part : {"phi or c is not finite at step ", "block on level", "the last good state", "nan"})
         EXPECT_NE(message.find(part), std::string::npos) << message;
     }
     EXPECT_EQ(scene->caution().failures(), 6);  // the first and five more tries
