@@ -202,7 +202,7 @@ Settings::Settings() {
       } catch (const std::invalid_argument&) {  // reported above
       }
     }
-    if (!sized || !seeded) return;
+    if (!sized || !seeded || mesh.root_blocks.has_value() != mesh.levels.has_value()) return;
     std::vector<physics::SeedOptions> all = seed;
     try {
       all = all_seeds(choose_shape(size, mesh), s);
