@@ -3,6 +3,7 @@
 #                         Suites whose names begin with Mpi also run together on 2, 3 and 4 ranks.
 #   tests/clients/*.py    run as `python3 FILE BUILD_DIR SOURCE_DIR`; a name that begins with _ is a helper;
 #                         exit status 77 means skipped.
+#   tests/fuzz/*.cpp      one program per dimension that spoils inputs and checkpoints; a short run of each is a test.
 #   tests/mpi_tests.cmake read if it exists: calls of dendrift_mpi_test().
 include(GoogleTest)
 
@@ -84,6 +85,30 @@ if(test_sources)
 else()
   message(STATUS "no tests/*/*_test.cpp: no GoogleTest programs")
 endif()
+
+# tests/fuzz/README.md has the long runs. Inputs of the other dimension are the other program's.
+set(fuzz_sources "${PROJECT_SOURCE_DIR}/tests/fuzz/targets.cpp" "${PROJECT_SOURCE_DIR}/tests/fuzz/mutate.cpp")
+option(DENDRIFT_LIBFUZZER "Build libFuzzer programs (clang, and CMAKE_CXX_FLAGS=-fsanitize=fuzzer-no-link)" OFF)
+foreach(dim IN ITEMS 2 3)
+  set(program dendrift_fuzz${dim}d)
+  add_executable(${program} "${PROJECT_SOURCE_DIR}/tests/fuzz/main.cpp" ${fuzz_sources})
+  target_link_libraries(${program} PRIVATE dendrift${dim}d_core dendrift_flags)
+  add_test(NAME ${dim}d.fuzz.inputs WORKING_DIRECTORY "${test_directory}"
+    COMMAND ${program} inputs "${PROJECT_SOURCE_DIR}/inputs" mutants=1000)
+  add_test(NAME ${dim}d.fuzz.checkpoint WORKING_DIRECTORY "${test_directory}"
+    COMMAND ${program} checkpoint mutants=60 what=content)
+  set_tests_properties(${dim}d.fuzz.inputs ${dim}d.fuzz.checkpoint PROPERTIES
+    ENVIRONMENT "${test_environment};OMP_NUM_THREADS=1" LABELS fuzz TIMEOUT ${DENDRIFT_TEST_TIMEOUT})
+  if(DENDRIFT_LIBFUZZER)
+    foreach(what IN ITEMS inputs checkpoint)
+      string(TOUPPER "DENDRIFT_FUZZ_${what}" macro)
+      add_executable(dendrift_libfuzzer_${what}${dim}d "${PROJECT_SOURCE_DIR}/tests/fuzz/libfuzzer.cpp" ${fuzz_sources})
+      target_compile_definitions(dendrift_libfuzzer_${what}${dim}d PRIVATE ${macro})
+      target_link_libraries(dendrift_libfuzzer_${what}${dim}d PRIVATE dendrift${dim}d_core dendrift_flags)
+      target_link_options(dendrift_libfuzzer_${what}${dim}d PRIVATE -fsanitize=fuzzer)
+    endforeach()
+  endif()
+endforeach()
 
 file(GLOB client_tests CONFIGURE_DEPENDS "${PROJECT_SOURCE_DIR}/tests/clients/*.py")
 list(FILTER client_tests EXCLUDE REGEX "/_[^/]*$")

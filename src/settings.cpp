@@ -43,6 +43,18 @@ void require_sane_tree(io::Checks& checks, const amr::MeshShape& shape, const Me
                 fmt::format("at most {} blocks along an axis on the finest level", amr::Tree::MOST_ALONG_AXIS), found);
 }
 
+// Each key of the alloy is in its range, but together they may leave the range of a double.
+bool finite(const physics::Scales& s) {
+  return std::ranges::all_of(std::array{s.c_l_wt, s.d0_um, s.w0_um, s.tau0_s, s.viscosity},
+                             [](double x) { return std::isfinite(x) && x > 0; });
+}
+
+// A device or a pipe might never end.
+bool may_be_read(const std::filesystem::path& path) {
+  std::error_code none;
+  return !std::filesystem::exists(path, none) || std::filesystem::is_regular_file(path, none);
+}
+
 }  // namespace
 
 void RunOptions::declare(io::Schema& schema) {
@@ -146,10 +158,20 @@ Settings::Settings() {
     }
     // The checks before this one have reported what is missing; it must not be read.
     const bool sized = mesh.size_w0 || mesh.size_um;
-    const bool seeded = std::ranges::all_of(seed, [](const physics::SeedOptions& o) {
+    const bool nothing_to_draw = seeding.count > 0 && !seeding.radius_w0 && !seeding.radius_um;
+    const bool seeded = !nothing_to_draw && std::ranges::all_of(seed, [](const physics::SeedOptions& o) {
       return (o.position_w0 || o.position_um) && (o.radius_w0 || o.radius_um);
     });
     const physics::Scales s(alloy);
+    if (!finite(s)) {
+      checks.fail("alloy", "numbers that give finite units of length and time",
+                  fmt::format("W0 = {:.3g} um, tau0 = {:.3g} s, viscosity = {:.3g} W0^2/tau0", s.w0_um, s.tau0_s, s.viscosity));
+      return;
+    }
+    if (!seeding.file.empty() && !may_be_read(std::filesystem::path(folder_) / seeding.file)) {
+      checks.fail("seeds.file", "a file, or a link to one");
+      return;
+    }
     RealVec size{};
     for (int a = 0; sized && a < DIM; ++a) size[a] = mesh.size_w0 ? (*mesh.size_w0)[a] : (*mesh.size_um)[a] / s.w0_um;
     try {
@@ -168,13 +190,19 @@ Settings::Settings() {
         {"output.diagnostics_every_tau0", output.diagnostics_every_tau0}};
     for (const auto& [key, tau0] : intervals)
       if (tau0 && *tau0 < SHORTEST) checks.fail(key, "at least .001 tau0: steps end on output times");
+    const std::pair<const char*, std::optional<double>> times[] = {{"run.end_time_s", run.end_time_s},
+                                                                   {"output.plot_every_s", output.plot_every_s},
+                                                                   {"output.diagnostics_every_s", output.diagnostics_every_s},
+                                                                   {"output.checkpoint_every_s", output.checkpoint_every_s}};
+    for (const auto& [key, seconds] : times)
+      if (seconds && !std::isfinite(*seconds / s.tau0_s)) checks.fail(key, fmt::format("a time that is finite in tau0 = {:.3g} s", s.tau0_s));
     if (sized && mesh.root_blocks.has_value() == mesh.levels.has_value() && checks.has_table("flow")) {
       try {
         flow.check_sides(checks, choose_shape(size, mesh));
       } catch (const std::invalid_argument&) {  // reported above
       }
     }
-    if (!sized || !seeded) return;
+    if (!sized || !seeded || mesh.root_blocks.has_value() != mesh.levels.has_value()) return;
     std::vector<physics::SeedOptions> all = seed;
     try {
       all = all_seeds(choose_shape(size, mesh), s);

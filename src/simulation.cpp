@@ -124,7 +124,11 @@ void Simulation::resume(const std::string& file, bool allow_changes) {
   const std::vector<int> fresh(at(tree.size()), -1);
   mesh_->install(std::move(tree), std::move(owners), fresh);
   io::read_fields(file, *mesh_);
-  recall(file, s);
+  try {
+    recall(file, s);
+  } catch (const std::out_of_range& e) {  // a list is shorter or longer than what it is for
+    throw io::OutputError(file, "restart", fmt::format("what it remembers does not fit the input: {}", e.what()));
+  }
   first_step_ = step_;
   resumed_ = true;
   starting_ = false;
@@ -141,12 +145,17 @@ void Simulation::recall(const std::string& file, const io::RunState& s) {
   time_ = s.time;
   step_ = s.step;
   const auto take = [&](const char* name) { return list(name).at(0); };
-  next_regrid_ = static_cast<std::int64_t>(take("next_regrid"));
+  const auto count = [&](const char* name) {
+    const double x = take(name);
+    if (std::abs(x) < 1e15) return static_cast<std::int64_t>(x);
+    throw io::OutputError(file, "restart", fmt::format("the file is damaged: {} is {}", name, x));
+  };
+  next_regrid_ = count("next_regrid");
   // Counted anew, because a restart may have other intervals.
   plots_ = next_multiple(time_, settings_.plot_interval);
   lines_ = next_multiple(time_, settings_.diagnostics_interval);
   checkpoints_ = next_multiple(time_, settings_.output.checkpoint_every_s / settings_.scales.tau0_s) - 1;
-  last_line_step_ = static_cast<std::int64_t>(take("last_line_step"));
+  last_line_step_ = count("last_line_step");
   initial_solute_ = take("initial_solute");
   const std::vector<double>& positions = list("crystals");
   const std::size_t each = positions.size() / std::max<std::size_t>(1, crystals_.size());
@@ -154,8 +163,13 @@ void Simulation::recall(const std::string& file, const io::RunState& s) {
   for (const auto& [name, values] : s.numbers)
     if (name.starts_with("tip.")) last_tips_[name.substr(4)] = values;
   for (const auto& m : modules_)
-    if (const auto memory = s.numbers.find(std::string("module.") + m->name()); memory != s.numbers.end())
+    if (const auto memory = s.numbers.find(std::string("module.") + m->name()); memory != s.numbers.end()) {
+      // Beside times, which alone the flow keeps and which may be large, there are counts.
+      const bool fits = std::ranges::all_of(memory->second, [](double x) { return std::abs(x) < std::numeric_limits<int>::max(); });
+      if (!fits && m->name() != std::string("flow"))
+        throw io::OutputError(file, "restart", fmt::format("the file is damaged: {} is {}", memory->first, memory->second));
       m->recall(memory->second);
+    }
 }
 
 std::string Simulation::origin() const {

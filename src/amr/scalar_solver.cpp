@@ -175,7 +175,8 @@ void ScalarSolver::apply(HierarchyField& x, bool homogeneous, const HierarchyFie
   fill(x, homogeneous);
   y.resize(pieces_.size());
   parallel_for(mesh_.size(), [&](int b) {
-    const auto [g, i] = hierarchy_.place_of_block(b);
+    const Hierarchy::Place place = hierarchy_.place_of_block(b);  // clang 14 captures no structured bindings
+    const int g = place.grid, i = place.node;
     const Grid& grid = hierarchy_.grid(g);
     Coefficients k;
     k.sigma = sigma_;
@@ -234,7 +235,8 @@ double ScalarSolver::largest(const Vector& v) const {
 double ScalarSolver::rounding(const Vector& x) const {
   double most = 0;
   for (int b = 0; b < mesh_.size(); ++b) {
-    const auto [g, i] = hierarchy_.place_of_block(b);
+    const Hierarchy::Place place = hierarchy_.place_of_block(b);  // clang 14 captures no structured bindings
+    const int g = place.grid, i = place.node;
     const Layout& layout = mesh_.layout();
     const double over = factor_ / (mesh_.block(b).dx * mesh_.block(b).dx);
     const double* p = x.data() + pieces_.first[at(b)];
@@ -388,7 +390,8 @@ void ScalarSolver::assemble() {
   bool several_levels = false;
   for (int leaf = 0; leaf < tree.size(); ++leaf) several_levels = several_levels || tree.leaf(leaf).level != tree.leaf(0).level;
   for (int b = 0; b < mesh_.size(); ++b) {
-    const auto [g, i] = hierarchy_.place_of_block(b);
+    const Hierarchy::Place place = hierarchy_.place_of_block(b);  // clang 14 captures no structured bindings
+    const int g = place.grid, i = place.node;
     const Block& block = mesh_.block(b);
     const double cell = std::pow(block.dx, DIM), link = std::pow(block.dx, DIM - 2) * factor_;
     for_each_cell({}, filled(n), [&](const IntVec& q) {

@@ -89,7 +89,7 @@ bool Tree::inside(BlockIndex& node) const {
     const int extent = root_blocks_[a] << node.level;
     if (node.coord[a] >= 0 && node.coord[a] < extent) continue;
     if (!periodic_[a]) return false;
-    node.coord[a] = (node.coord[a] + extent) % extent;
+    node.coord[a] = ((node.coord[a] % extent) + extent) % extent;
   }
   return true;
 }

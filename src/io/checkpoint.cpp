@@ -3,6 +3,7 @@
 #include <fmt/format.h>
 
 #include <algorithm>
+#include <cmath>
 #include <filesystem>
 #include <optional>
 
@@ -223,6 +224,8 @@ RunState read_state(const std::string& path, MPI_Comm comm) {
     s.dim = file.read_attribute<std::int32_t>("dim");
     s.time = file.read_attribute<double>("time_tau0");
     s.step = file.read_attribute<std::int64_t>("step");
+    if (!std::isfinite(s.time) || s.time < 0 || s.step < 0)
+      throw OutputError(path, "restart", fmt::format("the file is damaged: it is of step {} and time {}", s.step, s.time));
     s.input = text_of(file.open_dataset("input"));
     if (file.has("origin")) s.origin = text_of(file.open_dataset("origin"));
     const Group numbers = file.open_group("numbers");
@@ -270,7 +273,7 @@ void read_field(const Dataset& d, amr::Mesh& mesh, int id, std::span<const std::
   const IntVec n = mesh.fields().extent(id, mesh.layout().n);
   const auto length = static_cast<std::size_t>(volume(n));
   const std::size_t leaves = mesh.owners().size();
-  if (d.space().selected() != length * leaves || (!sums.empty() && sums.size() != leaves))
+  if (d.count() != length * leaves || (!sums.empty() && sums.size() != leaves))
     throw OutputError(d.path(), "restart", "field " + mesh.fields().row(id).name + " is not as long as the leaves need");
   std::vector<double> values(length);
   for (const amr::Block& b : mesh.blocks()) {

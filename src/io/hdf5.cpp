@@ -221,6 +221,19 @@ void Dataset::read(const Type& type, void* out, std::size_t count, const Dataspa
   throw OutputError(path(), "read dataset " + dataset_name(id()), reason);
 }
 
+std::size_t Dataset::count() const {
+  const hsize_t count = space().selected();
+  const Handle file(check(H5Iget_file_id(id()), path(), "find the file"), H5Fclose);
+  const Handle properties(check(H5Dget_create_plist(id()), path(), "read the layout of a dataset"), H5Pclose);
+  const Handle type(check(H5Dget_type(id()), path(), "read the type of a dataset"), H5Tclose);
+  hsize_t bytes = 0;
+  check(H5Fget_filesize(file.id(), &bytes), path(), "find the size of the file");
+  if (H5Pget_layout(properties.id()) != H5D_VIRTUAL) bytes = std::min(bytes, H5Dget_storage_size(id()));
+  if (count <= bytes / std::max<std::size_t>(1, H5Tget_size(type.id()))) return count;
+  throw OutputError(path(), "read dataset " + dataset_name(id()),
+                    "the file is damaged: it claims " + std::to_string(count) + " values in " + std::to_string(bytes) + " bytes");
+}
+
 FileRange Dataset::range() const {
   const haddr_t offset = H5Dget_offset(id());
   const hsize_t bytes = H5Dget_storage_size(id());

@@ -169,10 +169,13 @@ class Dataset : public Location {
   template <Number T>
   [[nodiscard]] std::vector<T> read_all() const {
     const Dataspace everything = space();
-    std::vector<T> values(everything.selected());
+    std::vector<T> values(count());
     read(std::span(values), everything, Transfer::independent);
     return values;
   }
+  /// Of the values. Throws if the file does not hold as many bytes: a damaged shape must not ask for all memory, nor have
+  /// HDF5 read where nothing is.
+  [[nodiscard]] std::size_t count() const;
   /// The shape, everything selected.
   [[nodiscard]] Dataspace space() const { return Dataspace::of_dataset(id(), path()); }
 
