@@ -16,12 +16,7 @@ namespace {
 
 constexpr double LEAST_C = -0.1;  // of c_l: what limited transport may undershoot in one cell, and more
 
-struct Bounds {
-  double max_c;
-  bool hold(double psi, double c) const { return std::isfinite(psi) && c > LEAST_C && c < max_c; }
-};
-
-// The same as hold, for a row: no branch, so that it costs a stream over the row.
+// Of a row of n cells. No branch, so that it costs a stream over the row.
 bool row_holds(const double* psi, const double* c, int n, double max_c) {
   constexpr double LARGEST = std::numeric_limits<double>::max();
   int bad = 0;
@@ -29,11 +24,10 @@ bool row_holds(const double* psi, const double* c, int n, double max_c) {
   return bad == 0;
 }
 
-std::string place_text(const amr::Mesh& mesh, int b, const IntVec& cell) {
-  const RealVec x = mesh.block(b).centre(cell);
+std::string text_of(const RealVec& x) {
   std::string text;
-  for (int a = 0; a < DIM; ++a) text += fmt::format("{}{:.6g}", a == 0 ? "" : ", ", x[a]);
-  return text;
+  for (int a = 0; a < DIM; ++a) text += fmt::format("{}{:.6g}", a == 0 ? "(" : ", ", x[a]);
+  return text + ")";
 }
 
 // Values in the plane through the cell, two cells to each side within the block; then what the block holds.
@@ -41,9 +35,8 @@ std::string around(const amr::Mesh& mesh, amr::CellField psi, amr::CellField c, 
   const amr::Layout& layout = mesh.layout();
   const amr::Block& block = mesh.block(b);
   constexpr int REACH = 2;
-  std::string text = fmt::format("block on level {} at (", block.index.level);
-  for (int a = 0; a < DIM; ++a) text += fmt::format("{}{:.6g}", a == 0 ? "" : ", ", block.lo[a]);
-  text += fmt::format(") W0, dx {:.6g} W0; phi, c/c_l around the cell (y downwards):\n", block.dx);
+  std::string text = fmt::format("block on level {} at {} W0, dx {:.6g} W0; phi, c/c_l around the cell (y downwards):\n",
+                                 block.index.level, text_of(block.lo), block.dx);
   for (int j = REACH; j >= -REACH; --j) {
     for (int i = -REACH; i <= REACH; ++i) {
       IntVec q = cell;
@@ -111,10 +104,11 @@ std::optional<std::string> find_fault(const amr::Mesh& mesh, amr::CellField psi,
     amr::for_each_cell({}, filled(layout.n), [&](const IntVec& q) {
       const std::ptrdiff_t o = layout.offset(q);
       const double p = mesh.cells(psi, b)[o], u = mesh.cells(c, b)[o];
-      if (found || Bounds{max_c}.hold(p, u)) return;
+      if (found || row_holds(&p, &u, 1, max_c)) return;
       found = true;
-      text = fmt::format("{} {}, at ({}) W0: phi = {:.6g}, c/c_l = {:.6g}\n{}",
-                         std::isfinite(p) && std::isfinite(u) ? "c is out of bounds" : "phi or c is not finite", when, place_text(mesh, b, q), physics::phi_of_psi(p), u, around(mesh, psi, c, b, q));
+      const char* what = std::isfinite(p) && std::isfinite(u) ? "c is out of bounds" : "phi or c is not finite";
+      text = fmt::format("{} {}, at {} W0: phi = {:.6g}, c/c_l = {:.6g}\n{}", what, when, text_of(mesh.block(b).centre(q)),
+                         physics::phi_of_psi(p), u, around(mesh, psi, c, b, q));
     });
   }
   const std::vector<char> all = amr::all_gather(std::span<const char>(text.data(), text.size()), mesh.comm());

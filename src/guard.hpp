@@ -21,8 +21,8 @@ struct GuardOptions {
   void declare(io::Schema& schema);
 };
 
-/// What is wrong with phi and c on any rank: the first block (by leaf) with a cell that is not finite or where c/c_l is not
-/// within -.1 and `max_c`, `when`, that cell, and the cells and blocks around it. The same text on all ranks. Collective.
+/// What is wrong with phi and c on any rank, and `when`: the first cell (by leaf) that is not finite or whose c/c_l is not
+/// within -.1 and `max_c`, its block, and the cells around it. The same text on all ranks. Collective.
 std::optional<std::string> find_fault(const amr::Mesh& mesh, amr::CellField psi, amr::CellField c, double max_c,
                                       const std::string& when);
 

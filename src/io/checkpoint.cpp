@@ -19,13 +19,6 @@ namespace {
 
 namespace fs = std::filesystem;
 
-std::vector<int> checkpointed(const amr::FieldTable& fields) {
-  std::vector<int> ids;
-  for (int i = 0; i < fields.size(); ++i)
-    if (fields.row(i).checkpoint) ids.push_back(i);
-  return ids;
-}
-
 template <Number T>
 void write_list(const Group& file, const std::string& name, const std::vector<T>& values) {
   const Dataspace space = Dataspace::simple(values.size());
@@ -145,6 +138,13 @@ std::string newer_format(int format) {
 }
 
 }  // namespace
+
+std::vector<int> checkpointed(const amr::FieldTable& fields) {
+  std::vector<int> ids;
+  for (int i = 0; i < fields.size(); ++i)
+    if (fields.row(i).checkpoint) ids.push_back(i);
+  return ids;
+}
 
 void write_checkpoint(const std::string& path, const amr::Mesh& mesh, const RunState& state) {
   const std::string part = path + ".part";

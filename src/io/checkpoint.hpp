@@ -24,6 +24,9 @@ struct RunState {
 };
 
 /// 1: no checksums. 2: a seal (io/seal.hpp), and a checksum of every leaf of every field.
+/// Numbers of the fields that a checkpoint holds.
+std::vector<int> checkpointed(const amr::FieldTable& fields);
+
 inline constexpr int CHECKPOINT_FORMAT = 2;
 
 // All but the first function are collective, and throw OutputError on every rank or none.

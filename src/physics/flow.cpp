@@ -27,12 +27,6 @@ RealVec centre_of(const amr::MeshShape& shape) {
 
 double of_gradient(const Gradient& g, int component, int along) { return g[at(component * DIM + along)]; }
 
-// r x f; in 2D the last component.
-std::array<double, 3> moment_of(const RealVec& r, const RealVec& f) {
-  if constexpr (DIM == 2) return {0, 0, r[0] * f[1] - r[1] * f[0]};
-  return {r[1] * f[2] - r[2] * f[1], r[2] * f[0] - r[0] * f[2], r[0] * f[1] - r[1] * f[0]};
-}
-
 amr::FieldSpec velocity_field() {
   amr::FieldSpec f;
   f.name = "velocity";
@@ -637,7 +631,7 @@ double Flow::unbalanced() const {
     if (!(crystals_[g].volume > 0) || held(crystals_[g]) || first == Neighbourhood::FIXED) continue;
     Body& body = bodies[at(first)];
     const RealVec r = mesh_->shape().way(crystals_[at(first)].position, crystals_[g].position);
-    const std::array<double, 3> lever = moment_of(r, loads[g].force);
+    const std::array<double, 3> lever = moment(r, loads[g].force);
     body.volume += crystals_[g].volume;
     for (int a = 0; a < DIM; ++a) {
       body.moment[a] += crystals_[g].volume * r[a];
@@ -650,7 +644,7 @@ double Flow::unbalanced() const {
     if (!(body.volume > 0)) continue;
     RealVec centre = body.moment;
     for (double& x : centre) x /= body.volume;
-    const std::array<double, 3> lever = moment_of(centre, body.load.force);
+    const std::array<double, 3> lever = moment(centre, body.load.force);
     const double radius = DIM == 2 ? std::sqrt(body.volume / std::numbers::pi) : std::cbrt(0.75 / std::numbers::pi * body.volume);
     const double drag = DIM == 2 ? 4 * std::numbers::pi : 6 * std::numbers::pi * radius;
     const double turning = DIM == 2 ? 4 * std::numbers::pi * radius : 8 * std::numbers::pi * radius * radius;  // torque per speed of the surface

@@ -97,6 +97,8 @@ Vector3 spin_of(const Vector3& l, const double* inertia) {
 
 }  // namespace
 
+std::array<double, 3> moment(const RealVec& r, const RealVec& f) { return cross(widened(r), widened(f)); }
+
 std::size_t crystal_of(const amr::Mesh& mesh, amr::CellField grain, const std::vector<Seed>& crystals, const RealVec& x, int b,
                        std::ptrdiff_t cell) {
   if (grain.id >= 0) return static_cast<std::size_t>(mesh.cells(grain, b)[cell]);

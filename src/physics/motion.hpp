@@ -16,6 +16,9 @@ namespace dendrift::physics {
 void measure_motion(const amr::Mesh& mesh, amr::CellField psi, amr::CellField grain, amr::FaceField velocity,
                     std::vector<Seed>& crystals);
 
+/// r x f; in 2D the last component.
+std::array<double, 3> moment(const RealVec& r, const RealVec& f);
+
 /// Net force and torque about the centre (2D: the last component), over the density of the melt.
 struct Load {
   RealVec force{};

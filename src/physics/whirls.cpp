@@ -198,8 +198,10 @@ Neighbourhood find_neighbourhood(const amr::Mesh& mesh, amr::CellField psi, amr:
     for (std::size_t g = 0; g < crystals.size(); ++g) {
       if (g == own || largest[g] == 0) continue;
       const RealVec r = shape.way(crystals[g].position, x);
-      if (length(r) < 2 * WIDEST * largest[g]) stamp(r, block.dx, least[g], [](double distance) { return distance; });
-      if (length(r) > 0 && length(r) < Directions::value(all[g].radius, r)) touching[g * crystals.size() + own] = 1;
+      const double distance = length(r);
+      if (distance < 2 * WIDEST * largest[g]) stamp(r, block.dx, least[g], [](double d) { return d; });
+      const bool near = distance > 0 && distance < largest[g];
+      if (near && distance < Directions::value(all[g].radius, r)) touching[g * crystals.size() + own] = 1;
     }
   });
   std::vector<double> links(touching.begin(), touching.end());

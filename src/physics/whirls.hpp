@@ -2,6 +2,8 @@
 /// Solids that may turn on their own, and the melt round each that its rotation may stir.
 #pragma once
 
+#include <algorithm>
+#include <cmath>
 #include <vector>
 
 #include "amr/mesh.hpp"

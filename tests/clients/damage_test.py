@@ -11,22 +11,13 @@ import h5py
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent / "lib"))
-from support import checkpoint_bits, differences, read_csv, require, reseal, run, say, scratch
+from support import CORNER_CRYSTAL, checkpoint_bits, differences, read_csv, require, reseal, run, say, scratch
 
 SCENE = """
 [run]
 end_time_tau0 = 100
 max_steps = 31
-[mesh]
-dim = 2
-size_W0 = [64, 32]
-root_blocks = [2, 1]
-levels = 3
-block_cells = 8
-[[seed]]
-position_W0 = [0, 0]
-radius_W0 = 8
-[output]
+""" + CORNER_CRYSTAL + """[output]
 dir = "run"
 diagnostics_every_tau0 = 0.3
 plot_every_tau0 = 0.5

@@ -11,22 +11,13 @@ import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "lib"))
-from support import BUILD, Result, check_result, command_line, environment, read_csv, require, run, say, scratch
+from support import BUILD, CORNER_CRYSTAL, Result, check_result, command_line, environment, read_csv, require, run, say, scratch
 
 SCENE = """
 [run]
 end_time_tau0 = 100
 max_steps = 11
-[mesh]
-dim = 2
-size_W0 = [64, 32]
-root_blocks = [2, 1]
-levels = 3
-block_cells = 8
-[[seed]]
-position_W0 = [0, 0]
-radius_W0 = 8
-[phase_field]
+""" + CORNER_CRYSTAL + """[phase_field]
 max_dt_tau0 = 0.01
 [output]
 dir = "disk/run"

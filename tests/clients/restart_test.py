@@ -9,22 +9,13 @@ import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent / "lib"))
-from support import column, command_line, environment, require, run, say, scratch, snapshot
+from support import CORNER_CRYSTAL, column, command_line, environment, require, run, say, scratch, snapshot
 
 SCENE = """
 [run]
 end_time_tau0 = 100
 max_steps = 21
-[mesh]
-dim = 2
-size_W0 = [64, 32]
-root_blocks = [2, 1]
-levels = 3
-block_cells = 8
-[[seed]]
-position_W0 = [0, 0]
-radius_W0 = 8
-[output]
+""" + CORNER_CRYSTAL + """[output]
 dir = "run"
 diagnostics_every_tau0 = 1
 checkpoint_every_steps = 10

@@ -25,8 +25,18 @@ ENVIRONMENT = {
 # A folder of its own for session files: two such programs on one machine would remove each other's.
 ENVIRONMENT["OMPI_MCA_orte_tmpdir_base"] = tempfile.mkdtemp(prefix="dendrift_mpi_")
 os.chmod(ENVIRONMENT["OMPI_MCA_orte_tmpdir_base"], 0o1777)  # run(user=...) needs it as well
-os.chmod(ENVIRONMENT["OMPI_MCA_orte_tmpdir_base"], 0o1777)  # some tests run as another user
 atexit.register(shutil.rmtree, ENVIRONMENT["OMPI_MCA_orte_tmpdir_base"], ignore_errors=True)
+# A crystal in the corner of a small box, on three levels.
+CORNER_CRYSTAL = """[mesh]
+dim = 2
+size_W0 = [64, 32]
+root_blocks = [2, 1]
+levels = 3
+block_cells = 8
+[[seed]]
+position_W0 = [0, 0]
+radius_W0 = 8
+"""
 CRASH_WORDS = ("terminate called", "Segmentation fault", "Assertion", "core dumped", "runtime error:",
                "AddressSanitizer", "Sanitizer:", "what():", "MPI_ABORT", "Signal:", "Traceback", "HDF5-DIAG")
 
