@@ -67,10 +67,7 @@ void FlowOptions::declare(io::Schema& schema) {
       .doc("of velocity and pressure; projection is cheaper a step, and wrong by the splitting");
   t.integer("projections", projections).range(1, 100).doc("passes of each step with coupling = \"projection\"");
   t.boolean("rotational", rotational).doc("the projection's pressure takes -nu div v as well");
-  t.real("tolerance", tolerance).range(1e-12, 0.1).doc("preconditioned residual of a solution over the norm of the velocity; crystals err by some 30 times as much");
-  t.real("crystal_tolerance", crystal_tolerance)
-      .range(1e-9, 1)
-      .doc("what a free crystal's force and torque may leave wrong of its motion, over the largest speed: iterations go on until then");
+  t.real("tolerance", tolerance).range(1e-12, 0.1).doc("preconditioned residual of a solution over the norm of the velocity; crystals err by some 10 times as much");
   t.integer("max_iterations", max_iterations).at_least(1).doc("of a solution; more is a numerical failure");
   t.integer("coarser_levels", coarser_levels)
       .range(0, 1)
@@ -484,12 +481,11 @@ void Flow::set_viscosity() {
   solver_->set_drag(phase, [&](double phi) { return nu * relative_drag(phi); }, centres, owners);
 }
 
-// Round each crystal that may turn: as far as walls and half the gaps to others let it, and no further than what makes a
-// difference. Crystals among the arms of others have none.
-void Flow::set_whirls() {
-  neighbourhood_ = find_neighbourhood(*mesh_, now_.psi, now_.grain, crystals_);
-  const bool turning = options_.coupling == Coupling::coupled && !penalised() && options_.stress == Stress::symmetric;
-  solver_->set_whirls(turning ? neighbourhood_.whirls : std::vector<Whirl>());
+void Flow::set_crystals() {
+  Neighbourhood found = find_neighbourhood(*mesh_, now_.psi, now_.grain, crystals_);
+  bodies_ = found.body;
+  const bool free = options_.coupling == Coupling::coupled && !penalised() && options_.stress == Stress::symmetric;
+  solver_->set_crystals(free ? std::move(found) : Neighbourhood());
 }
 
 // Eqs. (5) and (6): what is known of the momentum at the end of the interval.
@@ -627,7 +623,7 @@ double Flow::unbalanced() const {
   };
   std::vector<Body> bodies(crystals_.size());
   for (std::size_t g = 0; g < crystals_.size(); ++g) {
-    const int first = neighbourhood_.body[g];
+    const int first = bodies_[g];
     if (!(crystals_[g].volume > 0) || held(crystals_[g]) || first == Neighbourhood::FIXED) continue;
     Body& body = bodies[at(first)];
     const RealVec r = mesh_->shape().way(crystals_[at(first)].position, crystals_[g].position);
@@ -659,28 +655,6 @@ double Flow::unbalanced() const {
   return most;
 }
 
-// What is left may be small in the melt's norm and yet be the torque of a crystal, which from one good first guess to the next
-// would swing undamped. What cannot be mended at a reasonable cost stays, and stands in diagnostics.csv.
-void Flow::balance_crystals(double elapsed) {
-  constexpr double TIGHTER = 0.2, TIGHTEST = 5e-3, NOTHING = 1e-9;  // of the tolerance; cells
-  constexpr int MOST_ITERATIONS = 60;
-  const bool moves = fastest_ * elapsed > NOTHING * phase_mesh_->shape().dx(phase_mesh_->shape().max_level);
-  const int most = result_.iterations + MOST_ITERATIONS;
-  for (double wanted = TIGHTER * tolerance(); result_.converged && moves && unbalanced_ > options_.crystal_tolerance &&
-                                             wanted > TIGHTEST * tolerance() && result_.iterations < most;
-       wanted *= TIGHTER) {
-    const int before = result_.iterations;
-    const double unbalanced_before = unbalanced_;
-    result_ = solver_->improve(wanted, most - before);
-    result_.converged = std::isfinite(result_.error);  // it was before
-    result_.iterations += before;
-    fastest_ = result_.fastest;
-    unbalanced_ = unbalanced();
-    constexpr double HARDLY = 0.9;
-    if (unbalanced_ > HARDLY * unbalanced_before) break;
-  }
-}
-
 void Flow::solve(double elapsed) {
   std::vector<amr::CellField> seen{now_.psi, now_.c};
   if (now_.grain.id >= 0) seen.push_back(now_.grain);
@@ -688,7 +662,7 @@ void Flow::solve(double elapsed) {
   ghosts_->fill(seen);
   load();
   set_viscosity();
-  set_whirls();
+  set_crystals();
   const double sigma = 1 / elapsed;
   set_force(sigma);
   const Array<bool> unheld_axes = unheld();
@@ -704,7 +678,6 @@ void Flow::solve(double elapsed) {
   result_ = solver_->solve(sigma);
   fastest_ = result_.fastest;
   unbalanced_ = unbalanced();
-  balance_crystals(elapsed);
   if (!std::isfinite(result_.error))
     throw NumericalError("the flow is not finite: phi, c or the velocity before were not, or gravity is beyond all bounds");
   if (!result_.converged)

@@ -50,7 +50,6 @@ struct FlowOptions {
   int projections = 1;
   bool rotational = true;
   double tolerance = 1e-5;
-  double crystal_tolerance = 1e-3;
   int max_iterations = 300;
   int coarser_levels = 0;
   double courant = 0.5, max_interval_tau0 = 4, max_change = 0.05;
@@ -131,20 +130,19 @@ class Flow : public Module {
   void complete();
   void extrapolate(double elapsed);
   void set_viscosity();
-  void set_whirls();
+  void set_crystals();
   bool held(const Seed& crystal) const { return options_.motion == Motion::held || crystal.held; }
   bool penalised() const {
     return options_.solid == SolidModel::penalised || std::ranges::any_of(crystals_, [this](const Seed& s) { return held(s); });
   }
   void set_force(double sigma);
   void add_inertia(int b);
-  void balance_crystals(double elapsed);
   double unbalanced() const;
   Array<bool> unheld() const;
   RealVec means(const amr::HierarchyField& f) const;
   void shift(amr::HierarchyField& f, const RealVec& by, const Array<bool>& axes);
 
-  Neighbourhood neighbourhood_;  // at the last solution
+  std::vector<int> bodies_;  // Neighbourhood::body at the last solution
   FlowOptions options_;
   Scales scales_;
   std::vector<Seed>& crystals_;

@@ -71,6 +71,10 @@ StokesSolver::StokesSolver(const amr::Mesh& mesh, const StokesOptions& options)
     apply(work_, nullptr, image_);
     pack(image_, w);
   };
+  momentum_of_motion_ = [this, no_pressure = std::vector<double>(at(static_cast<int>(mesh.layout().size())))](
+                            int b, const Array<const double*>& v, const Array<double*>& out) {
+    momentum(b, v, no_pressure.data() + mesh_.layout().interior(), out);
+  };
   gmres_.precondition = [this](Vector& r) {
     unpack(r, image_);
     precondition(image_);
@@ -227,23 +231,6 @@ void StokesSolver::prepare_pressure() {
   pressure_cycle_->prepare({links});
 }
 
-// A cycle finds next to nothing of the error of a solid's spin: on coarse grids its surface is stiff as well. GMRES then
-// stops with the spin as it was guessed, for it is measured by what the preconditioner makes of a residual.
-void StokesSolver::prepare_turning() {
-  if (turning_.empty()) return;
-  for (int axis = 0; axis < TurningModes::AXES; ++axis) {
-    for_leaves([&](int, int g, int i, double) {
-      const Layout& layout = hierarchy_.grid(g).layout;
-      std::fill_n(work_.at(g, i, PRESSURE) - layout.interior(), layout.size(), 0.0);
-    });
-    turning_.write(axis, work_);
-    hierarchy_.make_composite(work_, 1, true);
-    apply(work_, nullptr, image_);
-    turning_.take_image(axis, image_);
-  }
-  turning_.prepare();
-}
-
 void StokesSolver::set_up_pieces() {
   pieces_.first.assign(1, 0);
   pieces_.weight.clear();
@@ -295,49 +282,62 @@ void StokesSolver::unpack(const Vector& v, HierarchyField& f) const {
   });
 }
 
+// sigma v - div[nu (grad v + grad v^T)] + grad p and what the solid's drag adds, on the unknown faces of local block b.
+void StokesSolver::momentum(int b, const Array<const double*>& velocity, const double* p, const Array<double*>& result) const {
+  const bool symmetric = options_.stress == Stress::symmetric;
+  const auto [g, i] = hierarchy_.place_of_block(b);
+  const Layout& layout = hierarchy_.grid(g).layout;
+  const double h = 1 / hierarchy_.grid(g).dx, h2 = h * h;
+  const double* nu = viscosity_.at(g, i, 0);
+  for (int a = 0; a < DIM; ++a) {
+    const std::ptrdiff_t s = layout.stride(a);
+    const double* v = velocity[a];
+    double* out = result[a];
+    const double twice = symmetric ? 2 * h2 : h2;
+    const Range r = hierarchy_.unknowns(g, i, components_[at(a)], true);
+    const std::ptrdiff_t start = layout.offset(r.lo);
+    amr::for_each_row(r.size, [&](const IntVec& row) {
+      const std::ptrdiff_t q0 = start + layout.offset(row);
+#pragma omp simd
+      for (std::ptrdiff_t q = q0; q < q0 + r.size[0]; ++q)
+        out[q] = sigma_ * v[q] - twice * (nu[q] * (v[q + s] - v[q]) - nu[q - s] * (v[q] - v[q - s])) + h * (p[q] - p[q - s]);
+      for (int e = 0; e < DIM; ++e) {
+        if (e == a) continue;
+        const std::ptrdiff_t t = layout.stride(e);
+        const double* edge = viscosity_.at(g, i, edge_component(a, e));
+        if (symmetric) {
+          const double* u = velocity[e];
+#pragma omp simd
+          for (std::ptrdiff_t q = q0; q < q0 + r.size[0]; ++q)
+            out[q] -= h2 * (edge[q + t] * ((v[q + t] - v[q]) + (u[q + t] - u[q + t - s])) -
+                            edge[q] * ((v[q] - v[q - t]) + (u[q] - u[q - s])));
+        } else {
+#pragma omp simd
+          for (std::ptrdiff_t q = q0; q < q0 + r.size[0]; ++q)
+            out[q] -= h2 * (edge[q + t] * (v[q + t] - v[q]) - edge[q] * (v[q] - v[q - t]));
+        }
+      }
+      if (drag_ == nullptr) return;
+      const double* kappa = drag_->at(g, i, a);
+#pragma omp simd
+      for (std::ptrdiff_t q = q0; q < q0 + r.size[0]; ++q) out[q] += kappa[q] * v[q];
+    });
+  }
+}
+
 // y = K x, or rhs - K x, on the leaves' unknowns. Ghosts of x are filled.
 void StokesSolver::apply(const HierarchyField& x, const HierarchyField* rhs, HierarchyField& y) {
-  const bool symmetric = options_.stress == Stress::symmetric;
   if (!bodies_.empty()) bodies_.fit(x);
   for_leaves([&](int b, int g, int i, double dx) {
     const Layout& layout = hierarchy_.grid(g).layout;
-    const double h = 1 / dx, h2 = h * h;
-    const double* nu = viscosity_.at(g, i, 0);
-    const double* p = x.at(g, i, PRESSURE);
+    const double h = 1 / dx;
+    Array<const double*> velocity;
+    Array<double*> result;
     for (int a = 0; a < DIM; ++a) {
-      const std::ptrdiff_t s = layout.stride(a);
-      const double* v = x.at(g, i, a);
-      double* out = y.at(g, i, a);
-      const double twice = symmetric ? 2 * h2 : h2;
-      const Range r = hierarchy_.unknowns(g, i, components_[at(a)], true);
-      const std::ptrdiff_t start = layout.offset(r.lo);
-      amr::for_each_row(r.size, [&](const IntVec& row) {
-        const std::ptrdiff_t q0 = start + layout.offset(row);
-#pragma omp simd
-        for (std::ptrdiff_t q = q0; q < q0 + r.size[0]; ++q)
-          out[q] = sigma_ * v[q] - twice * (nu[q] * (v[q + s] - v[q]) - nu[q - s] * (v[q] - v[q - s])) + h * (p[q] - p[q - s]);
-        for (int e = 0; e < DIM; ++e) {
-          if (e == a) continue;
-          const std::ptrdiff_t t = layout.stride(e);
-          const double* edge = viscosity_.at(g, i, edge_component(a, e));
-          if (symmetric) {
-            const double* u = x.at(g, i, e);
-#pragma omp simd
-            for (std::ptrdiff_t q = q0; q < q0 + r.size[0]; ++q)
-              out[q] -= h2 * (edge[q + t] * ((v[q + t] - v[q]) + (u[q + t] - u[q + t - s])) -
-                              edge[q] * ((v[q] - v[q - t]) + (u[q] - u[q - s])));
-          } else {
-#pragma omp simd
-            for (std::ptrdiff_t q = q0; q < q0 + r.size[0]; ++q)
-              out[q] -= h2 * (edge[q + t] * (v[q + t] - v[q]) - edge[q] * (v[q] - v[q - t]));
-          }
-        }
-        if (drag_ == nullptr) return;
-        const double* kappa = drag_->at(g, i, a);
-#pragma omp simd
-        for (std::ptrdiff_t q = q0; q < q0 + r.size[0]; ++q) out[q] += kappa[q] * v[q];
-      });
+      velocity[a] = x.at(g, i, a);
+      result[a] = y.at(g, i, a);
     }
+    momentum(b, velocity, x.at(g, i, PRESSURE), result);
     if (!bodies_.empty()) bodies_.subtract(b, y);
     double* div = y.at(g, i, PRESSURE);
     amr::for_each_row(filled(layout.n), [&](const IntVec& row) {
@@ -419,11 +419,11 @@ void StokesSolver::cycle_velocity(HierarchyField& r) {
   });
 }
 
-// In place: rotations of solids, then pressure from the divergence, then velocities from what both leave of the momentum.
+// In place: rigid motions of crystals, then pressure from the divergence, then velocities from what both leave of the momentum.
 void StokesSolver::precondition(HierarchyField& r) {
   const bool cycle = sigma_ > 0 || drag_ != nullptr;
   const double factor = drag_ != nullptr ? 1.0 : sigma_;  // of -div grad, or it is in the mobility
-  if (!turning_.empty()) turning_.take_from(r);
+  if (!rigid_.empty()) rigid_.take_from(r, momentum_of_motion_);
   if (cycle) cycle_pressure(r);
   for_leaves([&](int, int g, int i, double) {
     const Layout& layout = hierarchy_.grid(g).layout;
@@ -436,7 +436,7 @@ void StokesSolver::precondition(HierarchyField& r) {
   });
   hierarchy_.make_composite(pressure_, 1, true);
   cycle_velocity(r);
-  if (!turning_.empty()) turning_.add_to(r);
+  if (!rigid_.empty()) rigid_.add_to(r);
   for_leaves([&](int, int g, int i, double) {
     amr::copy_box(r.ref(g, i, PRESSURE), {}, std::as_const(pressure_).ref(g, i, 0), {}, filled(mesh_.layout().n));
   });
@@ -484,20 +484,10 @@ StokesResult StokesSolver::solve(double sigma) {
     finish(x, result);
     return result;
   }
-  prepare_turning();
-  return iterate(std::move(x), options_.tolerance, options_.max_iterations);
-}
-
-StokesResult StokesSolver::improve(double tolerance, int max_iterations) {
-  Vector x;
-  pack(state_, x);
-  return iterate(std::move(x), tolerance, max_iterations);
-}
-
-StokesResult StokesSolver::iterate(Vector x, double tolerance, int max_iterations) {
+  rigid_.prepare(momentum_of_motion_);
   amr::GmresOptions o;
-  o.max_iterations = max_iterations;
-  o.tolerance = tolerance;
+  o.max_iterations = options_.max_iterations;
+  o.tolerance = options_.tolerance;
   const amr::GmresResult g = gmres_.solve(x, pieces_, o, [this](const Vector& now) { return size(now); });
   StokesResult result;
   result.iterations = g.iterations;

@@ -13,7 +13,7 @@
 #include "amr/krylov.hpp"
 #include "amr/multigrid.hpp"
 #include "physics/rigid_bodies.hpp"
-#include "physics/turning_modes.hpp"
+#include "physics/rigid_modes.hpp"
 
 namespace dendrift::physics {
 
@@ -42,7 +42,7 @@ struct StokesResult {
 
 /// Solver for one mesh; build it anew when the mesh changes. Components of its fields: the velocities, then the pressure.
 ///
-/// GMRES on the whole system. Preconditioner: the rotations of solids first (TurningModes), then one multigrid cycle on the
+/// GMRES on the whole system. Preconditioner: rigid motions of crystals first (RigidModes), then one multigrid cycle on the
 /// viscous operator, all components together, and nu + sigma (-Lap)^-1 for the pressure (Cahouet & Chabard, Int. J. Numer.
 /// Methods Fluids 8, 869 (1988)), the inverse Laplacian being one cycle as well.
 class StokesSolver {
@@ -66,12 +66,10 @@ class StokesSolver {
   void set_drag(const std::function<void(int b, double* phi)>& phase, const std::function<double(double)>& law,
                 const std::vector<RealVec>& centres, const RigidBodies::Owners& owners = {});
 
-  /// Solids whose rotations the preconditioner is to know: they should turn freely. Of the coupled solution only.
-  void set_whirls(const std::vector<Whirl>& whirls) { turning_.build(hierarchy_, components_, whirls); }
+  /// Crystals whose rigid motions the preconditioner is to know: they should be free to turn. Of the coupled solution only.
+  void set_crystals(Neighbourhood n) { rigid_.build(hierarchy_, components_, std::move(n)); }
 
   StokesResult solve(double sigma);
-  /// Goes on from the last solution to a smaller tolerance.
-  StokesResult improve(double tolerance, int max_iterations);
   /// What the last solution leaves of the momentum equation, on the unknown faces of the leaves. Faces that finer leaves
   /// own, and those of walls, hold nothing of use.
   const amr::HierarchyField& residual() const { return image_; }
@@ -91,13 +89,12 @@ class StokesSolver {
   void set_up_pieces();
   std::vector<amr::Links> velocity_links(double sigma) const;
   void prepare_pressure();
-  void prepare_turning();
+  void momentum(int b, const Array<const double*>& v, const double* p, const Array<double*>& out) const;
   void apply(const amr::HierarchyField& x, const amr::HierarchyField* rhs, amr::HierarchyField& y);
   void precondition(amr::HierarchyField& r);
   void cycle_pressure(amr::HierarchyField& r);
   void cycle_velocity(amr::HierarchyField& r);
   void cycle_momentum(amr::HierarchyField& r);
-  StokesResult iterate(Vector x, double tolerance, int max_iterations);
   StokesResult project(Vector& x);
   void project_pass(Vector& x, StokesResult& result);
   void subtract_gradient(const amr::HierarchyField& p, double factor, amr::HierarchyField& v) const;
@@ -125,7 +122,8 @@ class StokesSolver {
   amr::HierarchyField state_, force_, work_, image_, viscosity_, pressure_;
   std::unique_ptr<amr::HierarchyField> drag_, mobility_;  // on faces: kappa and 1/(sigma + kappa)
   RigidBodies bodies_;
-  TurningModes turning_;
+  RigidModes rigid_;
+  RigidModes::Momentum momentum_of_motion_;  // of block b, without pressure
   std::unique_ptr<amr::Multigrid> velocity_cycle_, pressure_cycle_;
   amr::Pieces pieces_;
   amr::Gmres gmres_, momentum_, poisson_;

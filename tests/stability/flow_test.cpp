@@ -321,12 +321,11 @@ TEST(HardFlow, GrowingCrystal) {
   EXPECT_EQ(grow({"flow.motion=held"}).first, 0);
 }
 
-// Its spin is -gamma/2 from first guess to first guess, without a word on how wrong crystals may move.
+// Its spin is -gamma/2 from first guess to first guess.
 TEST(HardFlow, SmallDiscInAWideStream) {
   for (const double gamma : {2e-3, -2e-2}) {
     Scene scene(rigid_scene(place(256, 256), seed("[128, 128]", 8)),
-                {"flow.gravity_um_s2=0", fmt::format("flow.wall_gradient_per_tau0=[0, {}, 0, 0]", gamma),
-                 "flow.crystal_tolerance=1"});
+                {"flow.gravity_um_s2=0", fmt::format("flow.wall_gradient_per_tau0=[0, {}, 0, 0]", gamma)});
     const std::string what = fmt::format("gamma = {}", gamma);
     for (int i = 1; i <= 10; ++i) {
       follow(scene, 10 + 2 * i, what);  // the melt is set in motion from the walls before
