@@ -5,6 +5,7 @@
 #include <mpi.h>
 
 #include <algorithm>
+#include <cmath>
 #include <memory>
 #include <span>
 #include <vector>
@@ -54,6 +55,13 @@ struct Block {
     for (int a = 0; a < DIM; ++a) x[a] = lo[a] + (cell[a] + 0.5) * dx;
     return x;
   }
+  /// Centre and radius of the ball round a block of n cells a side.
+  RealVec middle(int n) const {
+    RealVec x = lo;
+    for (double& y : x) y += 0.5 * n * dx;
+    return x;
+  }
+  double ball(int n) const { return 0.5 * n * dx * std::sqrt(static_cast<double>(DIM)); }
 };
 
 enum class Side : std::uint8_t { wall, symmetry, open, periodic };

@@ -533,13 +533,15 @@ void Flow::add_inertia(int b) {
   for (int a = 0; a < DIM; ++a) {
     const double* v = state.at(g, i, a);
     double* f = solver_->force().at(g, i, a);
+    Array<const double*> velocity;
+    for (int e = 0; e < DIM; ++e) velocity[e] = state.at(g, i, e);
     IntVec size = filled(layout.n);
     ++size[a];
     amr::for_each_cell({}, size, [&](const IntVec& cell) {
       const std::ptrdiff_t q = layout.offset(cell);
       for (int e = 0; e < DIM; ++e) {
         const std::ptrdiff_t s = layout.stride(e), t = layout.stride(a);
-        const double* u = state.at(g, i, e) + q;
+        const double* u = velocity[e] + q;
         const double speed = e == a ? v[q] : 0.25 * ((u[0] + u[s]) + (u[-t] + u[s - t]));
         const std::ptrdiff_t d = speed > 0 ? -s : s;  // towards where the fluid comes from
         // The high side of a block has one face beyond it: first order there, against the axis.
@@ -691,11 +693,13 @@ void Flow::solve(double elapsed) {
   double change = 0;
   for (int b = 0; b < mesh_->size(); ++b) {
     const auto [g, i] = solver_->hierarchy().place_of_block(b);
-    for (int a = 0; a < DIM; ++a)
+    for (int a = 0; a < DIM; ++a) {
+      const double *v = solver_->state().at(g, i, a), *before = mesh_->faces(now_.v, a, b);
       amr::for_each_cell({}, filled(mesh_->layout().n), [&](const IntVec& q) {
-        const double v = solver_->state().at(g, i, a)[mesh_->layout().offset(q)];
-        change = std::max(change, std::abs(v - mesh_->faces(now_.v, a, b)[mesh_->layout().offset(q)]));
+        const std::ptrdiff_t o = mesh_->layout().offset(q);
+        change = std::max(change, std::abs(v[o] - before[o]));
       });
+    }
   }
   change = amr::global_max(change, mesh_->comm());
   store(elapsed);

@@ -66,11 +66,12 @@ void Grains::initialize() {
   const amr::Layout& layout = mesh_->layout();
   amr::parallel_for(mesh_->size(), [&](int b) {
     double* grain = mesh_->cells(grain_, b);
+    const amr::Block& block = mesh_->block(b);
+    const std::vector<std::size_t> near = deepest(crystals_, mesh_->shape(), block.middle(layout.n), block.ball(layout.n));
     amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
       double most = -1e300;
-      for (std::size_t g = 0; g < crystals_.size(); ++g) {
-        if (!crystals_[g].present) continue;
-        const double depth = crystals_[g].depth(from_centre(crystals_[g], mesh_->block(b), cell));
+      for (const std::size_t g : near) {
+        const double depth = crystals_[g].depth(from_centre(crystals_[g], block, cell));
         if (depth <= most) continue;
         most = depth;
         grain[layout.offset(cell)] = static_cast<double>(g);

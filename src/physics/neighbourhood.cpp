@@ -185,8 +185,7 @@ struct Finder {
   std::vector<Neighbourhood::Share> shares(int b, std::vector<Gap>& gaps) const {
     const amr::Block& block = mesh.block(b);
     const double dx = block.dx, half = 0.5 * (layout.n + 2) * dx;
-    RealVec middle = block.lo;
-    for (double& x : middle) x += 0.5 * layout.n * dx;
+    const RealVec middle = block.middle(layout.n);
     std::vector<Neighbourhood::Share> found;
     for (std::size_t k = 0; k < crystals.size(); ++k) {
       if (crystals[k].radius == 0) continue;

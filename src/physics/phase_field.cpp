@@ -47,12 +47,10 @@ void set_seeds(amr::Mesh& mesh, amr::CellField psi, const std::vector<Seed>& see
   const amr::Block& block = mesh.block(b);
   const amr::Layout& layout = mesh.layout();
   double* p = mesh.cells(psi, b);
+  const std::vector<std::size_t> near = deepest(seeds, mesh.shape(), block.middle(layout.n), block.ball(layout.n));
   amr::for_each_cell({}, filled(layout.n), [&](const IntVec& c) {
     double value = -PSI_MAX;
-    for (const Seed& s : seeds) {
-      if (!s.present) continue;
-      value = std::max(value, s.depth(mesh.shape().way(s.position, block.centre(c))));
-    }
+    for (const std::size_t g : near) value = std::max(value, seeds[g].depth(mesh.shape().way(seeds[g].position, block.centre(c))));
     p[layout.offset(c)] = std::min(value, PSI_MAX);
   });
 }

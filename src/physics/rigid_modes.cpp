@@ -83,9 +83,7 @@ RealVec RigidModes::first_corner(int b, std::size_t crystal) const {
   const amr::Mesh& mesh = hierarchy_->mesh();
   const amr::Block& block = mesh.block(b);
   const double half = 0.5 * mesh.layout().n * block.dx;
-  RealVec middle = block.lo;
-  for (double& x : middle) x += half;
-  RealVec r = mesh.shape().way(neighbourhood_.crystals[crystal].centre, middle);
+  RealVec r = mesh.shape().way(neighbourhood_.crystals[crystal].centre, block.middle(mesh.layout().n));
   for (double& x : r) x -= half + block.dx;
   return r;
 }

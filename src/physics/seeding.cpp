@@ -10,6 +10,7 @@
 #include <fstream>
 #include <numbers>
 
+#include "amr/loops.hpp"
 #include "physics/counter_random.hpp"
 
 namespace dendrift::physics {
@@ -101,11 +102,67 @@ SeedOptions seed_of(const Row& row) {
   return s;
 }
 
+// Places that keep a distance, in a grid of cells of at least that size: a search looks at a cell and those around it.
+class Places {
+ public:
+  Places(const amr::MeshShape& shape, double apart, int expected) : shape_(shape), apart_(apart), periodic_(shape.periodic()) {
+    const double most = std::ceil(std::pow(4.0 * expected, 1.0 / DIM));  // cells along an axis
+    int count = 1;
+    for (int a = 0; a < DIM; ++a) {
+      const double extent = shape.hi()[a] - shape.lo[a];
+      cells_[a] = static_cast<int>(std::clamp(std::floor(extent / std::max(apart, 1e-300)), 1.0, most));
+      width_[a] = extent / cells_[a];
+      count *= cells_[a];
+    }
+    lists_.resize(static_cast<std::size_t>(count));
+  }
+
+  bool near(const RealVec& x) const {
+    const IntVec home = cell(x);
+    bool found = false;
+    amr::for_each_cell(filled(-1), filled(3), [&](const IntVec& step) {
+      IntVec c = home;
+      for (int a = 0; a < DIM; ++a) {
+        c[a] += step[a];
+        if (periodic_[a]) c[a] = (c[a] + cells_[a]) % cells_[a];
+        if (c[a] < 0 || c[a] >= cells_[a]) return;
+      }
+      for (const RealVec& other : lists_[list(c)]) {
+        const RealVec way = shape_.way(x, other);
+        double square = 0;
+        for (const double r : way) square += r * r;
+        found = found || square < apart_ * apart_;
+      }
+    });
+    return found;
+  }
+  void add(const RealVec& x) { lists_[list(cell(x))].push_back(x); }
+
+ private:
+  IntVec cell(const RealVec& x) const {
+    IntVec c{};
+    for (int a = 0; a < DIM; ++a) c[a] = std::clamp(static_cast<int>((x[a] - shape_.lo[a]) / width_[a]), 0, cells_[a] - 1);
+    return c;
+  }
+  std::size_t list(const IntVec& c) const {
+    std::size_t n = 0;
+    for (int a = DIM - 1; a >= 0; --a) n = n * static_cast<std::size_t>(cells_[a]) + static_cast<std::size_t>(c[a]);
+    return n;
+  }
+
+  const amr::MeshShape& shape_;
+  double apart_;
+  Array<bool> periodic_;
+  IntVec cells_{};
+  RealVec width_{};
+  std::vector<std::vector<RealVec>> lists_;
+};
+
 }  // namespace
 
 void SeedingOptions::declare(io::Schema& schema) {
   io::Table& t = schema.table("seeds", "more crystals beside [[seed]]: at random, or from a file");
-  t.integer("count", count).range(0, 1'000'000).doc("crystals at random places, with random orientations");
+  t.integer("count", count).range(0, 10'000).doc("crystals at random places, with random orientations");
   t.integer("generator", generator).doc("number that selects the places; the same on any number of ranks");
   t.real("radius_um", radius_um).unit("um").above(0).doc("radius at phi = 0 of those at random; or radius_W0");
   t.real("radius_W0", radius_w0).unit("W0").above(0).doc("radius at phi = 0 of those at random");
@@ -148,6 +205,7 @@ std::vector<SeedOptions> SeedingOptions::at_random(const amr::MeshShape& shape, 
     return unit(mix(mix(mix(mix(static_cast<std::uint64_t>(generator)) ^ seed) ^ attempt) ^ what));
   };
   constexpr int ATTEMPTS = 10'000;
+  Places taken(shape, apart, count);
   for (int i = 0; i < count; ++i) {
     const auto number = static_cast<std::uint64_t>(i);
     SeedOptions s;
@@ -155,17 +213,9 @@ std::vector<SeedOptions> SeedingOptions::at_random(const amr::MeshShape& shape, 
       RealVec x{};
       for (int a = 0; a < DIM; ++a)
         x[a] = lo[a] + (hi[a] - lo[a]) * draw(number, static_cast<std::uint64_t>(attempt), static_cast<std::uint64_t>(a));
-      const auto close = [&](const SeedOptions& other) {
-        double square = 0;
-        for (int a = 0; a < DIM; ++a) {
-          double r = x[a] - (*other.position_w0)[a];
-          const double extent = corner[a] - shape.lo[a];
-          if (shape.periodic()[a]) r -= extent * std::round(r / extent);
-          square += r * r;
-        }
-        return square < apart * apart;
-      };
-      if (std::ranges::none_of(seeds, close)) s.position_w0 = x;
+      if (taken.near(x)) continue;
+      taken.add(x);
+      s.position_w0 = x;
     }
     if (!s.position_w0)
       throw SeedingProblem("seeds.count", fmt::format("seeds that have room: {} found none after {} attempts", i + 1, ATTEMPTS),

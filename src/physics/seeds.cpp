@@ -161,6 +161,24 @@ double Seed::depth(const RealVec& r) const {
   return -distance_from_ellipse(semi_axes(), {std::abs(along), std::sqrt(std::max(0.0, square - along * along))});
 }
 
+std::vector<std::size_t> deepest(const std::vector<Seed>& crystals, const amr::MeshShape& shape, const RealVec& middle, double radius) {
+  std::vector<double> depths(crystals.size(), -1e300);
+  double most = -1e300;
+  const auto uncertain = [&](std::size_t g) {  // of an ellipse: depth() far away is that of its circle
+    const std::array<double, 2> axes = crystals[g].semi_axes();
+    return radius + std::abs(axes[0] - axes[1]);
+  };
+  for (std::size_t g = 0; g < crystals.size(); ++g) {
+    if (!crystals[g].present) continue;
+    depths[g] = crystals[g].depth(shape.way(crystals[g].position, middle));
+    most = std::max(most, depths[g] - uncertain(g));
+  }
+  std::vector<std::size_t> list;
+  for (std::size_t g = 0; g < crystals.size(); ++g)
+    if (crystals[g].present && depths[g] + uncertain(g) >= most) list.push_back(g);
+  return list;
+}
+
 void Seed::advance(double dt) {
   for (int a = 0; a < DIM; ++a) position[a] += dt * velocity[a];
   const double rate = std::hypot(spin[0], spin[1], spin[2]);

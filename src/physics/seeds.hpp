@@ -7,7 +7,7 @@
 #include <span>
 #include <vector>
 
-#include "amr/dim.hpp"
+#include "amr/mesh.hpp"
 #include "io/config.hpp"
 #include "physics/scales.hpp"
 
@@ -54,6 +54,9 @@ struct Seed {
   /// Distance from the surface at the start, positive inside; r: place relative to the centre.
   double depth(const RealVec& r) const;
 };
+
+/// Crystals that are there and of which, for some place in a ball, none other has a larger Seed::depth.
+std::vector<std::size_t> deepest(const std::vector<Seed>& crystals, const amr::MeshShape& shape, const RealVec& middle, double radius);
 
 /// Whether crystals may have several orientations at some time: they start with several, or may turn.
 bool several_orientations(const std::vector<Seed>& crystals, bool turning);

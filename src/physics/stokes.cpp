@@ -203,10 +203,10 @@ void StokesSolver::set_drag(const std::function<void(int, double*)>& phase, cons
   double largest = 0;
   for (int b = 0; b < mesh_.size(); ++b) {
     const auto [g, i] = hierarchy_.place_of_block(b);
-    for (int a = 0; a < DIM; ++a)
-      amr::for_each_cell({}, filled(mesh_.layout().n), [&](const IntVec& q) {
-        largest = std::max(largest, drag_->at(g, i, a)[mesh_.layout().offset(q)]);
-      });
+    for (int a = 0; a < DIM; ++a) {
+      const double* kappa = drag_->at(g, i, a);
+      amr::for_each_cell({}, filled(mesh_.layout().n), [&](const IntVec& q) { largest = std::max(largest, kappa[mesh_.layout().offset(q)]); });
+    }
   }
   largest_drag_ = std::max(amr::global_max(largest, mesh_.comm()), 1e-300);
   for (int g = 0; g + 1 < hierarchy_.grids(); ++g) hierarchy_.restrict_means(*drag_, *drag_, g);
@@ -296,6 +296,9 @@ void StokesSolver::momentum(int b, const Array<const double*>& velocity, const d
     const double twice = symmetric ? 2 * h2 : h2;
     const Range r = hierarchy_.unknowns(g, i, components_[at(a)], true);
     const std::ptrdiff_t start = layout.offset(r.lo);
+    const double* kappa = drag_ != nullptr ? drag_->at(g, i, a) : nullptr;
+    Array<const double*> edges{};
+    for (int e = 0; e < DIM; ++e) edges[e] = e == a ? nullptr : viscosity_.at(g, i, edge_component(a, e));
     amr::for_each_row(r.size, [&](const IntVec& row) {
       const std::ptrdiff_t q0 = start + layout.offset(row);
 #pragma omp simd
@@ -304,7 +307,7 @@ void StokesSolver::momentum(int b, const Array<const double*>& velocity, const d
       for (int e = 0; e < DIM; ++e) {
         if (e == a) continue;
         const std::ptrdiff_t t = layout.stride(e);
-        const double* edge = viscosity_.at(g, i, edge_component(a, e));
+        const double* edge = edges[e];
         if (symmetric) {
           const double* u = velocity[e];
 #pragma omp simd
@@ -317,8 +320,7 @@ void StokesSolver::momentum(int b, const Array<const double*>& velocity, const d
             out[q] -= h2 * (edge[q + t] * (v[q + t] - v[q]) - edge[q] * (v[q] - v[q - t]));
         }
       }
-      if (drag_ == nullptr) return;
-      const double* kappa = drag_->at(g, i, a);
+      if (kappa == nullptr) return;
 #pragma omp simd
       for (std::ptrdiff_t q = q0; q < q0 + r.size[0]; ++q) out[q] += kappa[q] * v[q];
     });
@@ -516,12 +518,14 @@ void StokesSolver::finish(const Vector& x, StokesResult& result) {
   if (scale > 0) result.error /= scale;
   double div = 0, fastest = 0;
   for (int b = 0; b < mesh_.size(); ++b) {
-    const auto [gr, i] = hierarchy_.place_of_block(b);
-    const Layout& layout = hierarchy_.grid(gr).layout;
+    const auto [g, i] = hierarchy_.place_of_block(b);
+    const Layout& layout = hierarchy_.grid(g).layout;
+    Array<const double*> velocity;
+    for (int a = 0; a < DIM; ++a) velocity[a] = state_.at(g, i, a);
     amr::for_each_cell({}, filled(layout.n), [&](const IntVec& q) {
       double sum = 0;
       for (int a = 0; a < DIM; ++a) {
-        const double* v = state_.at(gr, i, a) + layout.offset(q);
+        const double* v = velocity[a] + layout.offset(q);
         sum += v[layout.stride(a)] - v[0];
         fastest = std::max(fastest, std::abs(v[0]));
       }
