@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <iterator>
 
 #include "amr/comm.hpp"
 #include "amr/loops.hpp"
@@ -88,19 +89,22 @@ void measure(const Rim& rim, const RealVec& lo, double dx, const Corners& corner
   });
 }
 
-// The least number of each crystal's group; links[g * count + k]: g and k belong together. Fixed are those linked to one.
-std::vector<int> groups(const std::vector<bool>& links, const std::vector<bool>& fixed) {
-  const std::size_t count = fixed.size();
-  std::vector<int> group(count);
-  for (std::size_t g = 0; g < count; ++g) group[g] = fixed[g] ? Neighbourhood::FIXED : static_cast<int>(g);
+struct Gap {
+  std::size_t from, to;
+  double gap;
+};
+
+// The least number of each crystal's group, those linked by `links` being of one. Fixed are those linked to one.
+std::vector<int> groups(const std::vector<Gap>& links, const std::vector<bool>& fixed) {
+  std::vector<int> group;
+  for (std::size_t g = 0; g < fixed.size(); ++g) group.push_back(fixed[g] ? Neighbourhood::FIXED : static_cast<int>(g));
   for (bool changed = true; changed;) {
     changed = false;
-    for (std::size_t g = 0; g < count; ++g)
-      for (std::size_t k = 0; k < count; ++k) {
-        if (!links[g * count + k] || group[g] == group[k]) continue;
-        group[g] = group[k] = std::min(group[g], group[k]);
-        changed = true;
-      }
+    for (const Gap& l : links) {
+      if (group[l.from] == group[l.to]) continue;
+      group[l.from] = group[l.to] = std::min(group[l.from], group[l.to]);
+      changed = true;
+    }
   }
   return group;
 }
@@ -177,11 +181,7 @@ struct Finder {
     }
   }
 
-  struct Gap {
-    std::size_t from, to;
-    double gap;
-  };
-
+  // Of block b; and the least distances there between crystals.
   std::vector<Neighbourhood::Share> shares(int b, std::vector<Gap>& gaps) const {
     const amr::Block& block = mesh.block(b);
     const double dx = block.dx, half = 0.5 * (layout.n + 2) * dx;
@@ -248,21 +248,17 @@ Neighbourhood find_neighbourhood(const amr::Mesh& mesh, amr::CellField psi, amr:
   finder.find_rims();
   Neighbourhood result;
   result.shares.resize(at(mesh.size()));
-  std::vector<std::vector<Finder::Gap>> gaps(at(mesh.size()));
-  if (count > 0) amr::parallel_for(mesh.size(), [&](int b) { result.shares[at(b)] = finder.shares(b, gaps[at(b)]); });
-  std::vector<double> closest(count * count, -FAR);
-  for (const auto& part : gaps)
-    for (const Finder::Gap& g : part) closest[g.from * count + g.to] = std::max(closest[g.from * count + g.to], -g.gap);
-  closest = amr::global_max(std::move(closest), mesh.comm());
-  std::vector<bool> links(count * count), fixed;
-  for (std::size_t g = 0; g < count; ++g) {
-    fixed.push_back(finder.crystals[g].gap < STUCK);
-    for (std::size_t k = 0; k < count; ++k) {
-      const double gap = std::min(-closest[g * count + k], -closest[k * count + g]);
-      links[g * count + k] = gap < FROZEN;
-      finder.crystals[g].gap = std::min(finder.crystals[g].gap, gap);
-    }
-  }
+  std::vector<std::vector<Gap>> parts(at(mesh.size()));
+  if (count > 0) amr::parallel_for(mesh.size(), [&](int b) { result.shares[at(b)] = finder.shares(b, parts[at(b)]); });
+  std::vector<Gap> gaps;
+  for (const auto& part : parts) gaps.insert(gaps.end(), part.begin(), part.end());
+  gaps = amr::all_gather<Gap>(gaps, mesh.comm());
+  std::vector<bool> fixed;
+  for (const Neighbourhood::Crystal& c : finder.crystals) fixed.push_back(c.gap < STUCK);
+  for (const Gap& g : gaps)
+    for (const std::size_t k : {g.from, g.to}) finder.crystals[k].gap = std::min(finder.crystals[k].gap, g.gap);
+  std::vector<Gap> links;
+  std::ranges::copy_if(gaps, std::back_inserter(links), [](const Gap& g) { return g.gap < FROZEN; });
   result.body = groups(links, fixed);
   result.crystals = std::move(finder.crystals);
   return result;

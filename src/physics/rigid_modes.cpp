@@ -42,6 +42,29 @@ class Scratch {
   std::ptrdiff_t origin_ = 0;
 };
 
+// Calls f(offset, size, r) for rows of edges along the potential's component (2D: corners): parts there are means of p[0] and
+// p[step]; r is the place of the first.
+template <class F>
+void for_each_row_of_edges(const Corners& corners, int component, double dx, const RealVec& first, F&& f) {
+  IntVec size = filled(corners.pitch());
+  RealVec r0 = first;
+  std::ptrdiff_t step = 0;
+  if constexpr (DIM == 3) {
+    --size[component];
+    r0[component] += 0.5 * dx;
+    step = corners.stride(component);
+  }
+  amr::for_each_row(size, [&](const IntVec& row) {
+    RealVec r = r0;
+    std::ptrdiff_t offset = 0;
+    for (int a = 1; a < DIM; ++a) {
+      r[a] += row[a] * dx;
+      offset += row[a] * corners.stride(a);
+    }
+    f(offset, size[0], step, r);
+  });
+}
+
 }  // namespace
 
 void RigidModes::build(const amr::Hierarchy& hierarchy, const std::vector<amr::Component>& velocities, Neighbourhood neighbourhood) {
@@ -87,33 +110,6 @@ RealVec RigidModes::first_corner(int b, std::size_t crystal) const {
   for (double& x : r) x -= half + block.dx;
   return r;
 }
-
-namespace {
-
-// Calls f(offset, size, r) for rows of edges along the potential's component (2D: corners): parts there are means of p[0] and
-// p[step]; r is the place of the first.
-template <class F>
-void for_each_row_of_edges(const Corners& corners, int component, double dx, const RealVec& first, F&& f) {
-  IntVec size = filled(corners.pitch());
-  RealVec r0 = first;
-  std::ptrdiff_t step = 0;
-  if constexpr (DIM == 3) {
-    --size[component];
-    r0[component] += 0.5 * dx;
-    step = corners.stride(component);
-  }
-  amr::for_each_row(size, [&](const IntVec& row) {
-    RealVec r = r0;
-    std::ptrdiff_t offset = 0;
-    for (int a = 1; a < DIM; ++a) {
-      r[a] += row[a] * dx;
-      offset += row[a] * corners.stride(a);
-    }
-    f(offset, size[0], step, r);
-  });
-}
-
-}  // namespace
 
 // Z c on the faces of a block and one layer of ghosts; coefficients(crystal) -> c of this crystal. False: there is none.
 template <class C>
@@ -254,7 +250,6 @@ RigidModes::Coefficients RigidModes::known(std::size_t crystal) const {
 void RigidModes::prepare(const Momentum& momentum) {
   if (empty()) return;
   const amr::Mesh& mesh = hierarchy_->mesh();
-  const std::size_t crystals = count_.size();
   // Z^T K Z, block by block: of each pair of shares the products of all modes.
   std::vector<std::vector<std::array<Coefficients, MOST>>> parts(at(mesh.size()));
   amr::parallel_for(mesh.size(), [&](int b) {
@@ -280,45 +275,53 @@ void RigidModes::prepare(const Momentum& momentum) {
           parts[at(b)][s * shares.size() + t][at(mode)] = products(b, shares[t], curl);
       }
   });
-  std::vector<double> pairs(crystals * crystals, 0.0);
+  // Pairs of crystals that meet in a block anywhere, in order.
+  using Pair = std::array<int, 2>;
+  std::vector<Pair> pairs;
+  const auto sort = [&] {
+    std::ranges::sort(pairs);
+    pairs.erase(std::unique(pairs.begin(), pairs.end()), pairs.end());
+  };
   for (const auto& shares : neighbourhood_.shares)
     for (const auto& s : shares)
-      for (const auto& t : shares) pairs[at(s.crystal) * crystals + at(t.crystal)] = 1;
-  pairs = amr::global_max(std::move(pairs), mesh.comm());
-  std::vector<std::size_t> place(pairs.size());
-  std::size_t places = 0;
-  for (std::size_t p = 0; p < pairs.size(); ++p)
-    if (pairs[p] > 0) place[p] = places++;
+      for (const auto& t : shares) pairs.push_back({s.crystal, t.crystal});
+  sort();
+  pairs = amr::all_gather<Pair>(pairs, mesh.comm());
+  sort();
+  const auto place = [&](int g, int h) { return static_cast<std::size_t>(std::ranges::lower_bound(pairs, Pair{g, h}) - pairs.begin()); };
   constexpr std::size_t WIDTH = std::size_t{MOST} * MOST;
-  std::vector<amr::ExactSum> sums(places * WIDTH);
+  std::vector<amr::ExactSum> sums(pairs.size() * WIDTH);
   for (int b = 0; b < mesh.size(); ++b) {
     const auto& shares = neighbourhood_.shares[at(b)];
     for (std::size_t s = 0; s < shares.size(); ++s)
-      for (std::size_t t = 0; t < shares.size(); ++t)
+      for (std::size_t t = 0; t < shares.size(); ++t) {
+        amr::ExactSum* sum = sums.data() + place(shares[s].crystal, shares[t].crystal) * WIDTH;
         for (int k = 0; k < count_[at(shares[s].crystal)]; ++k)
           for (int l = 0; l < count_[at(shares[t].crystal)]; ++l)
-            sums[place[at(shares[s].crystal) * crystals + at(shares[t].crystal)] * WIDTH + at(k * MOST + l)].add(
-                parts[at(b)][s * shares.size() + t][at(k)][at(l)]);
+            sum[k * MOST + l].add(parts[at(b)][s * shares.size() + t][at(k)][at(l)]);
+      }
   }
   const std::vector<double> all = amr::exact_sums(sums, mesh.comm());
-  scale_.assign(at(size_), 1.0);
-  for (std::size_t g = 0; g < crystals; ++g)
-    for (int k = 0; k < count_[g]; ++k) {
-      const double own = pairs[g * crystals + g] > 0 ? all[place[g * crystals + g] * WIDTH + at(k * MOST + k)] : 0;
-      scale_[at(first_[g] + k)] = own > 0 ? 1 / std::sqrt(own) : 0;
+  scale_.assign(at(size_), 0.0);
+  for (std::size_t p = 0; p < pairs.size(); ++p) {
+    const int g = pairs[p][0];
+    for (int k = 0; k < count_[at(g)] && g == pairs[p][1]; ++k) {
+      const double own = all[p * WIDTH + at(k * MOST + k)];
+      if (own > 0) scale_[at(first_[at(g)] + k)] = 1 / std::sqrt(own);
     }
+  }
   // Symmetric but for faces between levels. What no block holds stays at 0.
   std::vector<amr::SparseSolver::Entry> entries;
-  for (std::size_t g = 0; g < crystals; ++g)
-    for (std::size_t h = 0; h < crystals; ++h) {
-      if (pairs[g * crystals + h] == 0) continue;
-      for (int k = 0; k < count_[g]; ++k)
-        for (int l = 0; l < count_[h]; ++l) {
-          const int row = first_[g] + k, column = first_[h] + l;
-          const double mean = 0.5 * (all[place[g * crystals + h] * WIDTH + at(k * MOST + l)] + all[place[h * crystals + g] * WIDTH + at(l * MOST + k)]);
-          entries.push_back({row, column, mean * scale_[at(row)] * scale_[at(column)]});
-        }
-    }
+  for (std::size_t p = 0; p < pairs.size(); ++p) {
+    const auto [g, h] = pairs[p];
+    const std::size_t other = place(h, g);
+    for (int k = 0; k < count_[at(g)]; ++k)
+      for (int l = 0; l < count_[at(h)]; ++l) {
+        const int row = first_[at(g)] + k, column = first_[at(h)] + l;
+        const double mean = 0.5 * (all[p * WIDTH + at(k * MOST + l)] + all[other * WIDTH + at(l * MOST + k)]);
+        entries.push_back({row, column, mean * scale_[at(row)] * scale_[at(column)]});
+      }
+  }
   for (int i = 0; i < size_; ++i)
     if (scale_[at(i)] == 0) entries.push_back({i, i, 1.0});
   inverse_ = amr::SparseSolver();  // the pattern changes

@@ -1,6 +1,9 @@
 #!/usr/bin/python3
 """The same bits on any number of ranks and threads, with either partitioner, and through a restart on other numbers of
-them: checkpoints, diagnostics.csv (but wall_s), tips.csv and the last plotfile (but the owners)."""
+them: checkpoints, diagnostics.csv (but wall_s), tips.csv and the last plotfile (but the owners).
+
+Arguments: BUILD SOURCE [STEPS]. With STEPS (200, say) instead: each scene for so many steps in one go, and half of them, a
+restart, and the rest, on one rank and on others."""
 import shutil
 import sys
 from pathlib import Path
@@ -15,7 +18,7 @@ from support import Failure, checkpoint_bits, column, differences, fail, read_cs
 # is one after a checkpoint: a run that ends writes none.
 COMMON = """
 [output]
-checkpoint_every_steps = 8
+checkpoint_every_steps = {every}
 keep_checkpoints = 100
 diagnostics_every_tau0 = {lines}
 [run]
@@ -250,9 +253,10 @@ def first_difference(a, b):
     return next(((x, y) for x, y in zip(a, b) if x != y), f"their lengths, {len(a)} and {len(b)} lines")
 
 
-def check_scene(name, numbers, text):
+def check_scene(name, numbers, text, steps=None):
     folder = scratch()
     scene = folder / "scene.toml"
+    numbers = dict(numbers, every=8) if steps is None else dict(numbers, every=steps // 2, steps=steps + 1)
     scene.write_text(COMMON.format(**numbers) + text)
 
     def go(where, ranks, threads, partitioner, *words):
@@ -267,7 +271,7 @@ def check_scene(name, numbers, text):
     levels = max(column(folder / "reference/diagnostics.csv", "levels", int))
     require(changes >= 3 and levels >= 3,
             f"{name}: {changes} changes of the number of blocks {blocks}, {levels} levels")
-    require(len(reference.checkpoints) >= 3, f"{name}: only {len(reference.checkpoints)} checkpoints")
+    require(len(reference.checkpoints) >= (3 if steps is None else 2), f"{name}: only {len(reference.checkpoints)} checkpoints")
     require(len(reference.tips[1]) >= 4 * len(reference.diagnostics) // 2, f"{name}: too few tips found")
 
     # The comparison sees what must differ: other random numbers.
@@ -280,7 +284,7 @@ def check_scene(name, numbers, text):
             fail(f"{name}: another noise_seed changes nothing")
 
     owners = {}
-    runs = FEW_RUNS if name.startswith("2D flow ") or name.startswith("2D flow,") else RUNS[name[:2]]
+    runs = FEW_RUNS if steps is not None or name.startswith("2D flow ") or name.startswith("2D flow,") else RUNS[name[:2]]
     for ranks, threads, partitioner in runs:
         label = f"{ranks}r{threads}t_{partitioner}"
         output = go(label, ranks, threads, partitioner)
@@ -309,7 +313,7 @@ def main():
     failures = []
     for name, (numbers, text) in SCENES.items():
         try:
-            check_scene(name, numbers, text)
+            check_scene(name, numbers, text, *map(int, sys.argv[3:4]))
         except Failure as failure:
             failures.append(name)
             say(f"{failure}")
