@@ -469,8 +469,7 @@ void Simulation::check_totals(const Totals& t) const {
   if (!std::isfinite(t.solute_mean))
     throw NumericalError(fmt::format("phi or c is not finite at step {}, t = {:.6g} tau0", step_, time_));
   const auto& sides = settings_.shape.sides;
-  const bool open = std::ranges::find(sides, amr::Side::open) != sides.end() ||
-                    (settings_.has_flow() && settings_.flow.through_walls(settings_.shape));
+  const bool open = std::ranges::find(sides, amr::Side::open) != sides.end() || settings_.flow.through_walls(settings_.shape);
   // Crystals that are drawn where they should be push no solute.
   if (!open && !settings_.phase_field.rigid && std::abs(solute_drift(t)) > settings_.guard.max_solute_drift)
     throw NumericalError(fmt::format("solute is not conserved at step {}, t = {:.6g} tau0: it has changed by {:.3g} of what there was",

@@ -116,6 +116,12 @@ amr::SideValue FlowOptions::wall_value(const amr::MeshShape& shape, int axis, in
 }
 
 bool FlowOptions::through_walls(const amr::MeshShape& shape) const {
+  for (int a = 0; a < DIM; ++a) {  // a prescribed velocity heeds no sides
+    if (shape.periodic()[a]) continue;
+    if (velocity_um_s.value_or(RealVec{})[a] != 0 || velocity_w0_tau0.value_or(RealVec{})[a] != 0) return true;
+    for (int b = 0; b < DIM && velocity_gradient_per_tau0; ++b)
+      if (of_gradient(*velocity_gradient_per_tau0, a, b) != 0) return true;
+  }
   for (int f = 0; f < FACES; ++f) {
     const int axis = face_axis(f);
     const amr::SideValue v = wall_value(shape, axis, f);

@@ -63,7 +63,7 @@ struct FlowOptions {
   bool prescribed() const { return velocity_um_s || velocity_w0_tau0 || velocity_gradient_per_tau0; }
   /// Component `axis` of the velocity on a side that is a wall.
   amr::SideValue wall_value(const amr::MeshShape& shape, int axis, int face) const;
-  /// Melt flows in or out through a wall.
+  /// Melt flows in or out through a side: a wall that lets it, or a prescribed velocity, which heeds none.
   bool through_walls(const amr::MeshShape& shape) const;
   /// What these options ask of the sides of the box.
   void check_sides(io::Checks& checks, const amr::MeshShape& shape) const;

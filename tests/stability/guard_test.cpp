@@ -122,6 +122,15 @@ TEST_F(Guard, RecoversFromASolverThatStalls) {
   EXPECT_NEAR(tip(*scene.simulation), tip(*sound.simulation), 2e-3 * tip(*sound.simulation));
 }
 
+// A prescribed velocity carries solute out through the sides of the box, and other solute in.
+TEST_F(Guard, SoluteThatIsCarriedThroughSidesIsNotLost) {
+  Scene scene(text("[flow]\nvelocity_gradient_per_tau0 = " + std::string(DIM == 2 ? "[0, -0.05, 0.05, 0]\n" : "[0, -0.05, 0, 0.05, 0, 0, 0, 0, 0]\n")),
+              SHORT);
+  EXPECT_EQ(scene->run(), Outcome::done);
+  EXPECT_EQ(scene->caution().failures(), 0);
+  EXPECT_GT(std::abs(scene->solute_drift(scene->totals())), 1e-6);
+}
+
 TEST_F(Guard, GivesUpWithTheCauseAndLosesNothing) {
   {
     Scene scene(text(), SHORT);
