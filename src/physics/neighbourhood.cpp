@@ -15,7 +15,7 @@ namespace {
 std::size_t at(int i) { return static_cast<std::size_t>(i); }
 
 constexpr double FAR = 1e30;
-constexpr double STIFF = 0;              // psi where the viscosity begins to differ from melt's
+constexpr double SOLID = 0;              // psi from which on a cell is a crystal's
 constexpr double WIDEST = 2;             // how far melt goes along, over the radius
 constexpr double FROZEN = 2, STUCK = 1;  // gap to a crystal, to a wall, below which the interfaces are one
 constexpr int BRICK = DIM == 2 ? 8 : 5;  // corners along an axis that look for the nearest point together
@@ -135,7 +135,7 @@ struct Finder {
     std::vector<int> owner(at(static_cast<int>(layout.size())), -1);
     amr::for_each_cell(filled(-amr::Layout::GHOSTS), filled(layout.pitch()), [&](const IntVec& q) {
       const std::ptrdiff_t o = layout.offset(q);
-      if (mesh.cells(psi, b)[o] < STIFF) return;
+      if (mesh.cells(psi, b)[o] < SOLID) return;
       owner[at(static_cast<int>(o + layout.interior()))] = static_cast<int>(crystal_of(mesh, grain, seeds, mesh.block(b).centre(q), b, o));
     });
     return owner;
