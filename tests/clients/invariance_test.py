@@ -291,7 +291,7 @@ def check_scene(name, numbers, text, steps=None):
         reference.require_same(output, f"{name}, {ranks} ranks, {threads} threads, {partitioner}")
         require(len(set(output.owners)) == ranks, f"{name}: only ranks {set(output.owners)} of {ranks} own blocks")
         owners[label] = output.owners
-    require((owners["4r1t_curve"] != owners["4r2t_graph"]).any(), f"{name}: curve and graph give the same owners")
+    require(steps is not None or (owners["4r1t_curve"] != owners["4r2t_graph"]).any(), f"{name}: curve and graph give the same owners")
 
     # From the middle: what the reference wrote later is not removed, but for the checkpoints.
     kept = list(reference.checkpoints)[: len(reference.checkpoints) // 2]
