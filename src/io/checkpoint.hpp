@@ -23,10 +23,10 @@ struct RunState {
   int format = 0;  ///< of the file that it was read from
 };
 
-/// 1: no checksums. 2: a seal (io/seal.hpp), and a checksum of every leaf of every field.
 /// Numbers of the fields that a checkpoint holds.
 std::vector<int> checkpointed(const amr::FieldTable& fields);
 
+/// 1: no checksums. 2: a seal (io/seal.hpp), and a checksum of every leaf of every field.
 inline constexpr int CHECKPOINT_FORMAT = 2;
 
 // All but the first function are collective, and throw OutputError on every rank or none.

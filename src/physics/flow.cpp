@@ -535,12 +535,11 @@ void Flow::add_inertia(int b) {
   const amr::Layout& layout = mesh_->layout();
   const auto [g, i] = solver_->hierarchy().place_of_block(b);
   const double h = 1 / mesh_->block(b).dx;
-  const amr::HierarchyField& state = solver_->state();
+  Array<const double*> velocity;
+  for (int a = 0; a < DIM; ++a) velocity[a] = std::as_const(solver_->state()).at(g, i, a);
   for (int a = 0; a < DIM; ++a) {
-    const double* v = state.at(g, i, a);
+    const double* v = velocity[a];
     double* f = solver_->force().at(g, i, a);
-    Array<const double*> velocity;
-    for (int e = 0; e < DIM; ++e) velocity[e] = state.at(g, i, e);
     IntVec size = filled(layout.n);
     ++size[a];
     amr::for_each_cell({}, size, [&](const IntVec& cell) {

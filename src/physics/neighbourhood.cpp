@@ -129,13 +129,14 @@ struct Finder {
   std::vector<Rim> rims{};
   std::vector<Neighbourhood::Crystal> crystals{};
   std::vector<double> reach{};  // how far melt goes along with each
+  std::vector<std::vector<int>> owners{};  // by block: whose each cell and ghost is, -1 in melt; empty where there is only melt
 
-  // Whose each cell of a block and its ghosts is, -1 in melt.
-  std::vector<int> owners(int b) const {
-    std::vector<int> owner(at(static_cast<int>(layout.size())), -1);
+  std::vector<int> find_owners(int b) const {
+    std::vector<int> owner;
     amr::for_each_cell(filled(-amr::Layout::GHOSTS), filled(layout.pitch()), [&](const IntVec& q) {
       const std::ptrdiff_t o = layout.offset(q);
       if (mesh.cells(psi, b)[o] < SOLID) return;
+      if (owner.empty()) owner.assign(at(static_cast<int>(layout.size())), -1);
       owner[at(static_cast<int>(o + layout.interior()))] = static_cast<int>(crystal_of(mesh, grain, seeds, mesh.block(b).centre(q), b, o));
     });
     return owner;
@@ -146,9 +147,11 @@ struct Finder {
       int crystal;
       RealVec r;
     };
+    owners.resize(at(mesh.size()));
     std::vector<std::vector<Point>> parts(at(mesh.size()));
     amr::parallel_for(mesh.size(), [&](int b) {
-      const std::vector<int> owner = owners(b);
+      const std::vector<int>& owner = owners[at(b)] = find_owners(b);
+      if (owner.empty()) return;
       amr::for_each_cell({}, filled(layout.n), [&](const IntVec& q) {
         const int* own = owner.data() + layout.interior() + layout.offset(q);
         bool rim = false;
@@ -199,13 +202,13 @@ struct Finder {
       measure(near.rim, way, dx, corners, found.back().part);
     }
     if (found.empty()) return found;
-    const std::vector<int> owner = owners(b);
+    const std::vector<int>& owner = owners[at(b)];
     const double finest = shape.dx(shape.max_level), skin = (DIM == 2 ? 0.75 : 0.9) * finest;  // from centres of cells to their corners
     std::vector<std::vector<double>> gap(found.size(), std::vector<double>(seeds.size(), FAR));
     amr::for_each_cell(filled(-1), filled(corners.pitch()), [&](const IntVec& q) {
       const std::size_t o = at(static_cast<int>(corners.offset(q)));
       int inside = -1;
-      for (int corner = 0; corner < 1 << DIM; ++corner) {
+      for (int corner = 0; !owner.empty() && corner < 1 << DIM; ++corner) {
         IntVec c = q;
         for (int a = 0; a < DIM; ++a) c[a] -= corner >> a & 1;
         const int own = owner[at(static_cast<int>(layout.interior() + layout.offset(c)))];

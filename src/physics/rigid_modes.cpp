@@ -123,8 +123,10 @@ bool RigidModes::velocity(int b, C&& coefficients, const Array<double*>& v) cons
   for (auto& s : sums) s.assign(corners.count(), 0.0);
   for (const Neighbourhood::Share& share : shares) {
     const std::size_t crystal = at(share.crystal);
+    const Coefficients c = coefficients(crystal);
+    if (std::ranges::all_of(c, [](double x) { return x == 0; })) continue;
     const RealVec first = first_corner(b, crystal);
-    const std::array<Polynomial, TURNS> list = potential(crystal, coefficients(crystal));
+    const std::array<Polynomial, TURNS> list = potential(crystal, c);
     for (int k = 0; k < TURNS; ++k) {
       const Polynomial& p = list[at(k)];
       for_each_row_of_edges(corners, k, dx, first, [&](std::ptrdiff_t offset, int size, std::ptrdiff_t step, const RealVec& r) {

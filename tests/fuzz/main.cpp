@@ -23,7 +23,6 @@
 #include <cstring>
 #include <filesystem>
 #include <fstream>
-#include <iterator>
 #include <map>
 #include <memory>
 #include <new>
@@ -38,11 +37,6 @@ namespace {
 using namespace dendrift;
 using namespace dendrift::fuzz;
 namespace fs = std::filesystem;
-
-std::string content_of(const fs::path& path) {
-  std::ifstream in(path, std::ios::binary);
-  return {std::istreambuf_iterator<char>(in), {}};
-}
 
 struct Options {
   std::string mode, what;
@@ -67,7 +61,7 @@ class Inputs : public Job {
     std::map<std::string, std::string> sorted;  // directories are in no order
     if (!folder.empty())
       for (const auto& entry : fs::recursive_directory_iterator(folder))
-        if (entry.path().extension() == ".toml") sorted[entry.path().string()] = content_of(entry.path());
+        if (entry.path().extension() == ".toml") sorted[entry.path().string()] = content_of(entry.path().string());
     for (const auto& [path, text] : sorted) {
       all_.push_back(text);
       if (text.find(mine) != std::string::npos) texts_.push_back(text);
@@ -186,7 +180,7 @@ int try_all(const std::string& title, const Options& o, const auto& make_job) {
     fmt::print(stderr, "mutant {}: {}, status {:#x}\n", board.number, hang ? "a hang" : "a crash", status);
     const auto job = make_job();
     const bool checkpoint = std::strcmp(job->suffix(), ".h5") == 0;
-    keep(o, checkpoint ? content_of(fs::path(o.save) / "last.h5") : job->mutant(board.number), job->suffix(), board.number);
+    keep(o, checkpoint ? content_of((fs::path(o.save) / "last.h5").string()) : job->mutant(board.number), job->suffix(), board.number);
     if (crashes + hangs > 200) {
       fmt::print(stderr, "that is enough\n");
       break;

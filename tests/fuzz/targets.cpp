@@ -61,11 +61,6 @@ void require_usable(const Settings& s) {
   }
 }
 
-std::string content_of(const std::string& path) {
-  std::ifstream in(path, std::ios::binary);
-  return {std::istreambuf_iterator<char>(in), {}};
-}
-
 // Removed first: of a damaged file HDF5 may keep something open, and it knows files by their inodes.
 void write(const std::string& path, const std::string& bytes) {
   std::filesystem::remove(path);
@@ -99,6 +94,11 @@ const std::vector<hsize_t>& odd_lengths() {
 }
 
 }  // namespace
+
+std::string content_of(const std::string& path) {
+  std::ifstream in(path, std::ios::binary);
+  return {std::istreambuf_iterator<char>(in), {}};
+}
 
 Verdict try_input(const std::string& text) {
   const auto settings = std::make_unique<Settings>();

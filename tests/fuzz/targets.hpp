@@ -13,6 +13,9 @@
 
 namespace dendrift::fuzz {
 
+/// All bytes of a file.
+std::string content_of(const std::string& path);
+
 struct Verdict {
   bool accepted = false;
   std::string cause;  ///< of a refusal, in a few words
