@@ -42,13 +42,48 @@ ArrayRef<double> GhostExchange::coarse_ref(double* p) const {
   return r;
 }
 
+namespace {
+
+// Bit d: what lies in direction d is coarser.
+std::uint32_t coarser_directions(const Tree& tree, int leaf) {
+  std::uint32_t bits = 0;
+  for (int d = 0; d < DIRECTIONS; ++d)
+    if (tree.neighbour(leaf, d).kind == Neighbour::Kind::coarser) bits |= 1U << d;
+  return bits;
+}
+
+// Shrinks a box of the coarse copy of a block of n cells a side to what the stencils of prolongation into the ghosts of
+// these directions read of it (as the sides of the domain mirror what is read, they ask for no more). False: nothing.
+bool clip_to_stencils(std::uint32_t coarser, int n, IntVec& lo, IntVec& size) {
+  IntVec first = filled(n), last = filled(-n);
+  for (int d = 0; d < DIRECTIONS; ++d) {
+    if ((coarser & (1U << d)) == 0) continue;
+    const IntVec o = direction_offset(d);
+    IntVec from{}, to{};
+    bool empty = false;
+    for (int a = 0; a < DIM; ++a) {
+      from[a] = std::max(lo[a], o[a] < 0 ? -COARSE_GHOSTS : o[a] > 0 ? n / 2 - 1 : -1);
+      to[a] = std::min(lo[a] + size[a], o[a] < 0 ? 1 : o[a] > 0 ? n / 2 + COARSE_GHOSTS : n / 2 + 1);
+      empty |= from[a] >= to[a];
+    }
+    for (int a = 0; a < DIM && !empty; ++a) {
+      first[a] = std::min(first[a], from[a]);
+      last[a] = std::max(last[a], to[a]);
+    }
+  }
+  if (first[0] >= last[0]) return false;
+  lo = first;
+  for (int a = 0; a < DIM; ++a) size[a] = last[a] - first[a];
+  return true;
+}
+
+}  // namespace
+
 void GhostExchange::copies_of(int leaf, std::vector<Source>& out) const {
   const Tree& tree = mesh_.tree();
   const int n = mesh_.layout().n;
   const IntVec coord = tree.leaf(leaf).coord;
-  bool near_coarser = false;
-  for (int d = 0; d < DIRECTIONS; ++d)
-    near_coarser |= tree.neighbour(leaf, d).kind == Neighbour::Kind::coarser;
+  const std::uint32_t coarser = coarser_directions(tree, leaf);
   std::vector<FinerNeighbour> finer;
   for (int d = 0; d < DIRECTIONS; ++d) {
     if (d == CENTRE) continue;
@@ -69,7 +104,7 @@ void GhostExchange::copies_of(int leaf, std::vector<Source>& out) const {
     if (nb.kind == Neighbour::Kind::same) {
       for (int a = 0; a < DIM; ++a) c.src_lo[a] = c.dst_lo[a] - o[a] * n;
       out.push_back({nb.leaf, c});
-      if (near_coarser) {
+      if (clip_to_stencils(coarser, n, k.dst_lo, k.size)) {
         k.restricts = true;
         for (int a = 0; a < DIM; ++a) k.src_lo[a] = 2 * k.dst_lo[a] - o[a] * n;
         out.push_back({nb.leaf, k});
@@ -117,8 +152,9 @@ void GhostExchange::rebuild() {
     const int leaf = mesh_.block(b).leaf;
     Plan plan;
     plan.first = static_cast<int>(copies_.size());
-    for (int d = 0; d < DIRECTIONS; ++d)
-      if (tree.neighbour(leaf, d).kind == Neighbour::Kind::coarser) plan.coarser |= 1U << d;
+    plan.coarser = coarser_directions(tree, leaf);
+    plan.rim_size = filled(mesh_.layout().n / 2);
+    clip_to_stencils(plan.coarser, mesh_.layout().n, plan.rim_lo, plan.rim_size);
     for (int f = 0; f < FACES; ++f) {
       const int d = direction_index(face_offset(f));
       if (tree.neighbour(leaf, d).kind == Neighbour::Kind::boundary) plan.outside |= 1U << f;
@@ -253,7 +289,9 @@ void GhostExchange::fill_coarse_and_prolong(const Plan& plan, CellField field, i
   const ArrayRef<double> block = array_ref(mesh_.cells(field, b), mesh_.layout());
   const ArrayRef<double> c = coarse_ref(coarse);
   const FieldSpec& spec = mesh_.fields().row(field.id);
-  restrict_cells(spec, c, {}, {block.p, block.stride}, {}, filled(n / 2));
+  IntVec from = plan.rim_lo;
+  for (int& x : from) x *= 2;
+  restrict_cells(spec, c, plan.rim_lo, {block.p, block.stride}, from, plan.rim_size);
   apply_sides(plan.outside, spec, c, n / 2, COARSE_GHOSTS);
   for (int d = 0; d < DIRECTIONS; ++d) {
     if ((plan.coarser & (1U << d)) == 0) continue;

@@ -62,6 +62,7 @@ class GhostExchange {
     int first = 0, last = 0;        // range of copies
     std::uint32_t coarser = 0;      // bit d: direction d is to be prolonged
     std::uint32_t outside = 0;      // bit f: face f is a side of the domain
+    IntVec rim_lo{}, rim_size{};    // coarse cells of the block itself that prolongation reads
   };
   struct Message {
     int rank = 0;

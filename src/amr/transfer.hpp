@@ -4,6 +4,7 @@
 
 #include <cmath>
 #include <cstddef>
+#include <type_traits>
 
 #include "amr/loops.hpp"
 #include "amr/mesh.hpp"
@@ -42,18 +43,31 @@ ArrayRef<T> packed_ref(T* p, const IntVec& size) {
   return r;
 }
 
+/// Calls f(width) with a width that the compiler knows where it is that of ghosts: loops over a few cells are all overhead
+/// otherwise.
+template <class F>
+inline void with_width(int width, F&& f) {
+  if (width == Layout::GHOSTS) {
+    f(std::integral_constant<int, Layout::GHOSTS>{});
+  } else {
+    f(width);
+  }
+}
+
 inline void copy_box(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<const double> src, const IntVec& src_lo,
                      const IntVec& size) {
   double* d0 = dst.at(dst_lo);
   const double* s0 = src.at(src_lo);
-  for_each_row(size, [&](const IntVec& row) {
-    double* d = d0;
-    const double* s = s0;
-    for (int a = 1; a < DIM; ++a) {
-      d += row[a] * dst.stride[a];
-      s += row[a] * src.stride[a];
-    }
-    for (int i = 0; i < size[0]; ++i) d[i] = s[i];
+  with_width(size[0], [&](auto width) {
+    for_each_row(size, [&](const IntVec& row) {
+      double* d = d0;
+      const double* s = s0;
+      for (int a = 1; a < DIM; ++a) {
+        d += row[a] * dst.stride[a];
+        s += row[a] * src.stride[a];
+      }
+      for (int i = 0; i < width; ++i) d[i] = s[i];
+    });
   });
 }
 
@@ -63,21 +77,23 @@ inline void restrict_box(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<co
   double* d0 = dst.at(dst_lo);
   const double* s0 = src.at(src_lo);
   const std::ptrdiff_t y = src.stride[1];
-  for_each_row(size, [&](const IntVec& row) {
-    double* d = d0;
-    const double* s = s0;
-    for (int a = 1; a < DIM; ++a) {
-      d += row[a] * dst.stride[a];
-      s += 2 * row[a] * src.stride[a];
-    }
-    for (int i = 0; i < size[0]; ++i, s += 2) {
-      double sum = (s[0] + s[1]) + (s[y] + s[y + 1]);
-      if constexpr (DIM == 3) {
-        const double* t = s + src.stride[2];
-        sum += (t[0] + t[1]) + (t[y] + t[y + 1]);
+  with_width(size[0], [&](auto width) {
+    for_each_row(size, [&](const IntVec& row) {
+      double* d = d0;
+      const double* s = s0;
+      for (int a = 1; a < DIM; ++a) {
+        d += row[a] * dst.stride[a];
+        s += 2 * row[a] * src.stride[a];
       }
-      d[i] = sum / CHILDREN;
-    }
+      for (int i = 0; i < width; ++i, s += 2) {
+        double sum = (s[0] + s[1]) + (s[y] + s[y + 1]);
+        if constexpr (DIM == 3) {
+          const double* t = s + src.stride[2];
+          sum += (t[0] + t[1]) + (t[y] + t[y + 1]);
+        }
+        d[i] = sum / CHILDREN;
+      }
+    });
   });
 }
 

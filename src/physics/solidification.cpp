@@ -46,11 +46,28 @@ void Solidification::declare(amr::FieldTable& fields) {
   c_other_ = fields.add_cell(scratch);
 }
 
+namespace {
+
+// Largest eigenvalue across the interface, in units of that along it, of the solute's 2 DIM + 1 point Laplacian of U = c/A:
+// the faces see (1-phi)/2 half a cell away, which for small k and coarse cells outweighs A = k + (1-k)(1-phi)/2.
+double stiffness_across(double k, double dx) {
+  double across = 1;
+  for (double psi = -8; psi < 8; psi += 0.05) {
+    const auto liquid = [](double x) { return 1 / (1 + std::exp(SQRT2 * x)); };
+    const double a = k + (1 - k) * liquid(psi);
+    across = std::max(across, 0.5 * (liquid(psi - 0.5 * dx) + liquid(psi + 0.5 * dx)) / a);
+  }
+  return across;
+}
+
+}  // namespace
+
 void Solidification::attach(amr::Mesh& mesh, amr::GhostExchange& ghosts) {
   mesh_ = &mesh;
   ghosts_ = &ghosts;
   fluxes_ = std::make_unique<amr::FluxRegister>(mesh);
   local_axes_.attach(mesh, ghosts);
+  across_ = stiffness_across(parameters_.k, mesh.shape().dx(mesh.shape().max_level));
   if (const auto v = mesh.fields().find("velocity_x")) velocity_.id = *v;
 }
 
@@ -63,16 +80,9 @@ void Solidification::draw(const std::vector<Seed>& crystals) {
   });
 }
 
-double Solidification::explicit_limit(double dx) const {
-  // Largest eigenvalue of the solute's 2 DIM + 1 point Laplacian of U = c/A over the interface: across it the
-  // faces see (1-phi)/2 half a cell away, which for small k and coarse cells outweighs A = k + (1-k)(1-phi)/2.
-  double across = 1;
-  for (double psi = -8; psi < 8; psi += 0.05) {
-    const auto liquid = [](double x) { return 1 / (1 + std::exp(SQRT2 * x)); };
-    const double a = parameters_.k + (1 - parameters_.k) * liquid(psi);
-    across = std::max(across, 0.5 * (liquid(psi - 0.5 * dx) + liquid(psi + 0.5 * dx)) / a);
-  }
-  const double solute = 4.0 * (across + DIM - 1) * parameters_.diffusivity;
+double Solidification::explicit_limit() const {
+  const double dx = mesh_->shape().dx(mesh_->shape().max_level);
+  const double solute = 4.0 * (across_ + DIM - 1) * parameters_.diffusivity;
   // The phase: (a_s + a_s'')/a_s along the interface times the isotropic Laplacian's 16/3; in 3D with a margin for
   // the anisotropic terms, which use plain differences.
   const double stiffness = (1 + 15 * phase_.anisotropy) / (1 - phase_.anisotropy);
@@ -95,8 +105,7 @@ double Solidification::sharpening_limit(int s) const {
 }
 
 double Solidification::largest_step(int s) const {
-  const double dx = mesh_->shape().dx(mesh_->shape().max_level);
-  return std::min({explicit_limit(dx) * (s * s + s) / 2, sharpening_limit(s), phase_.max_dt_tau0});
+  return std::min({explicit_limit() * (s * s + s) / 2, sharpening_limit(s), phase_.max_dt_tau0});
 }
 
 int Solidification::stages(double dt) const {

@@ -37,7 +37,7 @@ class Solidification : public Module {
   /// Fewest stages with which a step of dt is stable.
   int stages(double dt) const;
   /// Largest step of a single explicit stage on a mesh of spacing dx, from diffusion.
-  double explicit_limit(double dx) const;
+  double explicit_limit() const;
   /// Largest step of s stages of the phase, from the speed of the front when the mesh was last looked at.
   double sharpening_limit(int s) const;
   /// Largest step of s stages from all of these and the input.
@@ -62,6 +62,7 @@ class Solidification : public Module {
   amr::GhostExchange* ghosts_ = nullptr;
   std::unique_ptr<amr::FluxRegister> fluxes_;
   bool initializing_ = true;
+  double across_ = 1;   // stiffness of the solute's equation across the interface
   double fastest_ = 0;  // rate of psi in the interface when last looked at: the speed of the front
   std::vector<std::array<double, 2>> block_cost_;  // seconds, kind; of this rank's blocks
   std::array<double, 3> kind_cost_{0.2, 0.1, 1.0};  // relative cost of a block by BlockKind, measured
