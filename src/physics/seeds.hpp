@@ -55,7 +55,7 @@ struct Seed {
   double depth(const RealVec& r) const;
 };
 
-/// Crystals that are there and of which, for some place in a ball, none other has a larger Seed::depth.
+/// Crystals among which, of those that are there, the one with the largest Seed::depth is, for every place in a ball.
 std::vector<std::size_t> deepest(const std::vector<Seed>& crystals, const amr::MeshShape& shape, const RealVec& middle, double radius);
 
 /// Whether crystals may have several orientations at some time: they start with several, or may turn.

@@ -3,9 +3,12 @@
 
 #include <gtest/gtest.h>
 
+#include <algorithm>
+#include <array>
 #include <cmath>
 #include <filesystem>
 #include <fstream>
+#include <random>
 
 #include "settings.hpp"
 #include "support/mesh_fixture.hpp"
@@ -92,6 +95,45 @@ TEST(Seeding, SaysWhenThereIsNoRoom) {
   SeedingOptions o = options(1);
   o.clearance_w0 = 100;
   EXPECT_THROW(o.at_random(box(200, false), physics::Scales(physics::AlloyOptions{})), SeedingProblem);
+}
+
+// Places in balls of many sizes, circles and ellipses, some not there: the deepest of all is always listed, and far fewer
+// than all are.
+TEST(Deepest, ListsTheDeepestOfEveryPlaceInABall) {
+  constexpr double SIDE = 600;
+  for (const bool periodic : {false, true}) {
+    const amr::MeshShape shape = box(SIDE, periodic);
+    std::vector<SeedOptions> list = options(40).at_random(shape, physics::Scales(physics::AlloyOptions{}));
+    for (std::size_t i = 0; i < list.size(); ++i) list[i].aspect_ratio = i % 3 == 0 ? 1.0 : 0.3 + 0.1 * static_cast<double>(i);
+    std::vector<physics::Seed> crystals = physics::make_seeds(list, physics::Scales(physics::AlloyOptions{}));
+    for (std::size_t i = 0; i < crystals.size(); i += 7) crystals[i].present = false;
+    std::mt19937_64 generator(7);
+    std::uniform_real_distribution<double> place(0, SIDE), within(-1, 1);
+    std::size_t listed = 0;
+    constexpr int BALLS = 2000;
+    for (int ball = 0; ball < BALLS; ++ball) {
+      const double radius = std::array{0.0, 2.0, 5.0, 60.0}[static_cast<std::size_t>(ball % 4)];
+      RealVec middle;
+      for (double& x : middle) x = place(generator);
+      const std::vector<std::size_t> near = physics::deepest(crystals, shape, middle, radius);
+      listed += near.size();
+      for (const std::size_t g : near) EXPECT_TRUE(crystals[g].present);
+      for (int point = 0; point < 20; ++point) {
+        RealVec x = middle;
+        for (double& a : x) a += radius / std::sqrt(double{DIM}) * within(generator);
+        double most = -1e300;
+        std::size_t first = 0;
+        for (std::size_t g = 0; g < crystals.size(); ++g) {
+          const double depth = crystals[g].depth(shape.way(crystals[g].position, x));
+          if (!crystals[g].present || depth <= most) continue;
+          most = depth;
+          first = g;
+        }
+        EXPECT_TRUE(std::ranges::find(near, first) != near.end()) << "ball " << ball << ", crystal " << first;
+      }
+    }
+    EXPECT_LT(listed, BALLS * crystals.size() / 3);
+  }
 }
 
 class SeedFile : public ::testing::Test {
