@@ -2,7 +2,7 @@
 """The same bits on any number of ranks and threads, with either partitioner, and through a restart on other numbers of
 them: checkpoints, diagnostics.csv (but wall_s), tips.csv and the last plotfile (but the owners).
 
-Arguments: BUILD SOURCE [STEPS]. With STEPS (200, say) instead: each scene for so many steps in one go, and half of them, a
+Arguments: BUILD SOURCE [STEPS [SCENE...]]. With STEPS (200, say): each scene for so many steps in one go, and half of them, a
 restart, and the rest, on one rank and on others."""
 import shutil
 import sys
@@ -312,6 +312,8 @@ def check_scene(name, numbers, text, steps=None):
 def main():
     failures = []
     for name, (numbers, text) in SCENES.items():
+        if sys.argv[4:] and name not in sys.argv[4:]:
+            continue
         try:
             check_scene(name, numbers, text, *map(int, sys.argv[3:4]))
         except Failure as failure:
