@@ -163,13 +163,7 @@ void Simulation::recall(const std::string& file, const io::RunState& s) {
   for (const auto& [name, values] : s.numbers)
     if (name.starts_with("tip.")) last_tips_[name.substr(4)] = values;
   for (const auto& m : modules_)
-    if (const auto memory = s.numbers.find(std::string("module.") + m->name()); memory != s.numbers.end()) {
-      // Beside times, which alone the flow keeps and which may be large, there are counts.
-      const bool fits = std::ranges::all_of(memory->second, [](double x) { return std::abs(x) < std::numeric_limits<int>::max(); });
-      if (!fits && m->name() != std::string("flow"))
-        throw io::OutputError(file, "restart", fmt::format("the file is damaged: {} is {}", memory->first, memory->second));
-      m->recall(memory->second);
-    }
+    if (const auto memory = s.numbers.find(std::string("module.") + m->name()); memory != s.numbers.end()) m->recall(memory->second);
 }
 
 std::string Simulation::origin() const {

@@ -372,7 +372,7 @@ void Flow::recall(const std::vector<double>& m) {
   due_ = m.at(4) != 0;
   if (m.size() > 5) {  // what diagnostics.csv says until the next solution; older checkpoints lack it
     result_.divergence_max = m.at(5);
-    result_.iterations = static_cast<int>(m.at(6));
+    result_.iterations = remembered_count(m, 6);
     unbalanced_ = m.at(7);
   }
   recalled_ = true;

@@ -30,7 +30,7 @@ class Grains : public Module {
   void before_tagging() override;
   void tag(int b, amr::Tag& tag) const override;
   std::vector<double> memory() const override { return {static_cast<double>(waited_)}; }
-  void recall(const std::vector<double>& m) override { waited_ = static_cast<int>(m.at(0)); }
+  void recall(const std::vector<double>& m) override { waited_ = remembered_count(m, 0); }
 
  private:
   double move_markers(double dt);

@@ -3,6 +3,8 @@
 /// its table stands in the input. Modules do not include each other: they meet through fields.
 #pragma once
 
+#include <cmath>
+#include <limits>
 #include <memory>
 #include <stdexcept>
 #include <vector>
@@ -54,12 +56,20 @@ class Module {
   /// Speed at which what tag() looks at travels through the mesh. Ghosts are filled. Collective; the same on all ranks.
   virtual double front_speed() { return 0; }
   virtual void report(Report&) const {}
-  /// What a restart must know beside the fields, and giving it back.
+  /// What a restart must know beside the fields, and giving it back. recall throws std::out_of_range if the list is too short
+  /// or a count in it is none (remembered_count).
   virtual std::vector<double> memory() const { return {}; }
   virtual void recall(const std::vector<double>&) {}
   /// The steps after the recalled state led to a failure: intervals of its own begin small.
   virtual void be_careful() {}
 };
+
+/// A count among what a module remembers. Throws std::out_of_range if no int holds it.
+inline int remembered_count(const std::vector<double>& memory, std::size_t i) {
+  const double x = memory.at(i);
+  if (!(std::abs(x) < std::numeric_limits<int>::max())) throw std::out_of_range("a count that is none");
+  return static_cast<int>(x);
+}
 
 using Modules = std::vector<std::unique_ptr<Module>>;
 

@@ -48,7 +48,7 @@ class Orientation : public Module {
   std::vector<double> memory() const override { return {elapsed_, static_cast<double>(present_)}; }
   void recall(const std::vector<double>& m) override {
     elapsed_ = m.at(0);
-    present_ = static_cast<int>(m.at(1));
+    present_ = remembered_count(m, 1);
   }
 
   int solver_iterations() const { return iterations_; }  ///< of the last solution

@@ -2,14 +2,17 @@
 #include <gtest/gtest.h>
 #include <unistd.h>
 
+#include <cmath>
 #include <filesystem>
 #include <fstream>
+#include <limits>
 #include <string>
 #include <vector>
 
 #include "io/config.hpp"
 #include "io/crc32.hpp"
 #include "io/seal.hpp"
+#include "physics/module.hpp"
 
 namespace dendrift::test {
 namespace {
@@ -121,6 +124,14 @@ TEST(InputChanges, KeysOfAnotherVersion) {
   const auto gone = scene.schema.changes_since("[t]\na = 1.0\nb = 2.0\nold = 5\n");
   ASSERT_EQ(gone.size(), 1U);
   EXPECT_EQ(gone[0].key + gone[0].before + gone[0].after, "t.old5unknown to this version");
+}
+
+// Found by libFuzzer: a count of a module that no int holds.
+TEST(Memory, CountsThatNoIntHoldsAreRefused) {
+  const std::vector<double> memory{3, -7, 1e10, -1e300, std::nan(""), std::numeric_limits<double>::infinity()};
+  EXPECT_EQ(physics::remembered_count(memory, 0), 3);
+  EXPECT_EQ(physics::remembered_count(memory, 1), -7);
+  for (std::size_t i = 2; i < memory.size() + 1; ++i) EXPECT_THROW(physics::remembered_count(memory, i), std::out_of_range) << i;
 }
 
 }  // namespace
