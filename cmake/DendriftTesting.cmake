@@ -8,7 +8,7 @@
 include(GoogleTest)
 
 set(DENDRIFT_PYTHON "/usr/bin/python3" CACHE FILEPATH "Python with numpy, h5py, matplotlib and yt, for the tests")
-set(DENDRIFT_TEST_TIMEOUT 900 CACHE STRING "Limit of one test in seconds")
+set(DENDRIFT_TEST_TIMEOUT 2400 CACHE STRING "Limit of one test in seconds")
 set(default_mpiexec_flags "")
 if(MPI_C_LIBRARY_VERSION_STRING MATCHES "Open MPI" OR MPI_C_INCLUDE_DIRS MATCHES "openmpi")
   set(default_mpiexec_flags --oversubscribe --bind-to none)
