@@ -29,21 +29,22 @@ class GhostExchange {
 
   /// Fills ghosts and runs kernel(b) on each block as soon as its ghosts are there: blocks that need nothing
   /// from other ranks go first, while the messages travel. kernel may change any array of block b except the
-  /// interiors of `fields`, which other blocks still read. Collective.
+  /// interiors of `fields`, which other blocks still read. Blocks that are not `wanted` (by local number; null: all are)
+  /// are passed over: their ghosts stay what they were. Collective.
   template <class Kernel>
-  void fill_and_run(std::vector<CellField> fields, Kernel&& kernel) {
+  void fill_and_run(std::vector<CellField> fields, Kernel&& kernel, const std::vector<char>* wanted = nullptr) {
     start(std::move(fields));
-    parallel_for(static_cast<int>(inner_.size()), [&](int i) {
-      const int b = inner_[static_cast<std::size_t>(i)];
-      fill_block(b);
-      kernel(b);
-    });
+    const auto run = [&](const std::vector<int>& blocks) {
+      parallel_for(static_cast<int>(blocks.size()), [&](int i) {
+        const int b = blocks[static_cast<std::size_t>(i)];
+        if (wanted != nullptr && (*wanted)[static_cast<std::size_t>(b)] == 0) return;
+        fill_block(b);
+        kernel(b);
+      });
+    };
+    run(inner_);
     wait();
-    parallel_for(static_cast<int>(outer_.size()), [&](int i) {
-      const int b = outer_[static_cast<std::size_t>(i)];
-      fill_block(b);
-      kernel(b);
-    });
+    run(outer_);
   }
 
   double wait_seconds() const { return wait_seconds_; }  ///< waiting for messages so far

@@ -19,6 +19,7 @@ constexpr double TAU_ALPHA = 0.1, MU_OVER_E = 1875, BETA = 1e5;  // of eq. (4); 
 constexpr double LIQUID = -3.7429;  // psi of phi = -.99: below it alpha means nothing and is copied
 constexpr double CORE = 2.0821;     // psi of phi = .9: above it the melt's shear is not felt
 constexpr double COURANT = 0.6;
+constexpr double SLOW = 1e-3;  // of a cell in a step: one stage is as good as three
 constexpr int LAYERS_AT_REST = 2, LAYERS_MOVING = 4;
 
 std::size_t at(int i) { return static_cast<std::size_t>(i); }
@@ -167,10 +168,11 @@ void Orientation::advance(double, double dt, std::int64_t) {
     impose(moved, true);
     return;
   }
+  find_busy();
   const double crossing = fastest_crossing();
   if (crossing > 0) {
     const int steps = std::max(1, static_cast<int>(std::ceil(dt * crossing / COURANT - 1e-9)));
-    for (int i = 0; i < steps; ++i) carry(dt / steps);
+    for (int i = 0; i < steps; ++i) carry(dt / steps, dt * crossing < SLOW);
     turn(dt);
   }
   impose(moved, false);
@@ -183,12 +185,28 @@ void Orientation::advance(double, double dt, std::int64_t) {
   extend(alpha_, LIQUID, crossing > 0 ? LAYERS_MOVING : LAYERS_AT_REST, true);
 }
 
+// Where all is melt, far from any front, angles mean nothing; where no crystal is free, they are imposed.
+void Orientation::find_busy() {
+  const amr::Layout& layout = mesh_->layout();
+  busy_.assign(static_cast<std::size_t>(mesh_->size()), 0);
+  amr::parallel_for(mesh_->size(), [&](int b) {
+    const double *psi = mesh_->cells(psi_, b), *grain = mesh_->cells(grain_, b);
+    char& busy = busy_[at(b)];
+    amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
+      const std::ptrdiff_t q = layout.offset(cell);
+      if (busy == 0 && psi[q] > -PSI_MAX && free_cell(grain[q])) busy = 1;
+    });
+  });
+}
+
+// Cells a unit of time, where angles mean something.
 double Orientation::fastest_crossing() const {
   if (v_.id < 0) return 0;
   const amr::Layout& layout = mesh_->layout();
   double rate = 0;
   for (int b = 0; b < mesh_->size(); ++b)
-    amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
+    if (busy_[at(b)] != 0) amr::for_each_cell({}, filled(layout.n), [&](const IntVec& cell) {
+      if (mesh_->cells(psi_, b)[layout.offset(cell)] <= LIQUID) return;
       double sum = 0;
       for (int a = 0; a < DIM; ++a) sum += std::abs(mesh_->faces(v_, a, b)[layout.offset(cell)]);
       rate = std::max(rate, sum / mesh_->block(b).dx);
@@ -196,9 +214,14 @@ double Orientation::fastest_crossing() const {
   return amr::global_max(rate, mesh_->comm());
 }
 
-// v.grad alpha of eq. (4), by the three-stage Runge-Kutta method that makes no new extremes (Shu & Osher 1988).
-void Orientation::carry(double dt) {
+// v.grad alpha of eq. (4), by the three-stage Runge-Kutta method that makes no new extremes (Shu & Osher 1988), or its first
+// stage alone where all is so slow that its error in time is far below that of the differences: in a heap at rest.
+void Orientation::carry(double dt, bool slow) {
   carry_stage(alpha_, first_, 0, dt);
+  if (slow) {
+    mesh_->swap(alpha_, first_);
+    return;
+  }
   carry_stage(first_, second_, 0.75, dt);
   carry_stage(second_, first_, 1.0 / 3, dt);
   mesh_->swap(alpha_, first_);
@@ -207,8 +230,7 @@ void Orientation::carry(double dt) {
 // to = share * alpha + (1 - share) * (from - dt v.grad from), as changes from alpha.
 void Orientation::carry_stage(amr::CellField from, amr::CellField to, double share, double dt) {
   const amr::Layout& layout = mesh_->layout();
-  ghosts_->fill({from});
-  amr::parallel_for(mesh_->size(), [&](int b) {
+  const auto carry_block = [&](int b) {
     const double *x = mesh_->cells(from, b), *start = mesh_->cells(alpha_, b);
     double* out = mesh_->cells(to, b);
     const double over = dt / mesh_->block(b).dx;
@@ -228,6 +250,12 @@ void Orientation::carry_stage(amr::CellField from, amr::CellField to, double sha
       }
       out[q] = start[q] + (1 - share) * ((x[q] - start[q]) - over * change);
     });
+  };
+  ghosts_->fill_and_run({from}, carry_block, &busy_);
+  amr::parallel_for(mesh_->size(), [&](int b) {
+    if (busy_[at(b)] != 0) return;
+    const double* stays = mesh_->cells(alpha_, b) - layout.interior();
+    std::copy_n(stays, layout.size(), mesh_->cells(to, b) - layout.interior());
   });
 }
 
@@ -271,14 +299,16 @@ void Orientation::extend(amr::CellField values, double least, int layers, bool f
   for (int d = 0; d < DIRECTIONS; ++d)
     for (int a = 0; a < DIM; ++a) around[at(d)] += direction_offset(d)[a] * layout.stride(a);
   for (int done = 0; done < layers; done += amr::Layout::GHOSTS) {
-    if (done == 0) {
-      ghosts_->fill({psi_, grain_, values});
-    } else {
-      ghosts_->fill({values, valid_});
-    }
+    const auto fields = done == 0 ? std::vector{psi_, grain_, values} : std::vector{values, valid_};
+    ghosts_->fill_and_run(fields, [](int) {}, &busy_);
     amr::parallel_for(mesh_->size(), [&](int b) {
       const double *psi = mesh_->cells(psi_, b), *grain = mesh_->cells(grain_, b);
       double *value = mesh_->cells(values, b), *kept = mesh_->cells(valid_, b);
+      if (busy_[at(b)] == 0) {  // it may be copied from
+        if (done == 0)
+          for (std::ptrdiff_t q = -layout.interior(); q < layout.size() - layout.interior(); ++q) kept[q] = psi[q] > least ? 1 : 0;
+        return;
+      }
       thread_local std::vector<char> flags;
       flags.resize(static_cast<std::size_t>(layout.size()));
       char* valid = flags.data() + layout.interior();

@@ -57,7 +57,7 @@ class Orientation : public Module {
   void impose(const std::vector<Seed>& crystals, bool all);
   void welcome();
   void follow(const std::vector<Seed>& moved);
-  void carry(double dt);
+  void carry(double dt, bool slow);
   void carry_stage(amr::CellField from, amr::CellField to, double old_share, double dt);
   void turn(double dt);
   void extend(amr::CellField values, double least_psi, int layers, bool free_only);
@@ -65,6 +65,7 @@ class Orientation : public Module {
   double sweep(double dt, bool first);
   double set_system(int b, double dt, bool first);
   double fastest_crossing() const;
+  void find_busy();
   /// Whether eq. (4) holds in a crystal.
   bool free(const Seed& crystal) const { return options_.everywhere || crystal.touching; }
   bool free_cell(double grain) const { return free(crystals_[static_cast<std::size_t>(grain)]); }
@@ -75,6 +76,7 @@ class Orientation : public Module {
   amr::FaceField v_;  // id -1: nothing moves
   amr::Mesh* mesh_ = nullptr;
   amr::GhostExchange* ghosts_ = nullptr;
+  std::vector<char> busy_;  // by block: whether eq. (4) has anything to say there
   std::unique_ptr<amr::ScalarSolver> solver_;
   std::int64_t solver_generation_ = -1;
   double elapsed_ = 0;  // since alpha relaxed last
