@@ -547,7 +547,7 @@ def sheared():
     rows = []
     literal = ('flow.stress="laplacian"', 'flow.viscosity="linear"', 'solute.antitrapping="eulerian"')
     for model, keys in (("as it is", ()), ("as it is, flow coarser by a level", ("flow.coarser_levels=1",)),
-                        ("as it is, tolerances a tenth", ("flow.tolerance=1e-6",)), ("literal", literal)):
+                        ("as it is, tolerance a tenth", ("flow.tolerance=1e-6",)), ("literal", literal)):
         r = Run("dendrite_in_shear.toml", *keys)
         grains = list(csv.DictReader(open(os.path.join(r.dir, "grains.csv"))))
         late = [g for g in grains if float(g["time_s"]) / r.scale["tau0"] > 99]
