@@ -190,10 +190,12 @@ Settings::Settings() {
         {"output.diagnostics_every_tau0", output.diagnostics_every_tau0}};
     for (const auto& [key, tau0] : intervals)
       if (tau0 && *tau0 < SHORTEST) checks.fail(key, "at least .001 tau0: steps end on output times");
-    const std::pair<const char*, std::optional<double>> times[] = {{"run.end_time_s", run.end_time_s},
-                                                                   {"output.plot_every_s", output.plot_every_s},
-                                                                   {"output.diagnostics_every_s", output.diagnostics_every_s},
-                                                                   {"output.checkpoint_every_s", output.checkpoint_every_s}};
+    std::vector<std::pair<std::string, std::optional<double>>> times = {{"run.end_time_s", run.end_time_s},
+                                                                        {"output.plot_every_s", output.plot_every_s},
+                                                                        {"output.diagnostics_every_s", output.diagnostics_every_s},
+                                                                        {"output.checkpoint_every_s", output.checkpoint_every_s},
+                                                                        {"seeds.last_nucleation_time_s", seeding.last_time_s}};
+    for (std::size_t i = 0; i < seed.size(); ++i) times.emplace_back(fmt::format("seed[{}].nucleation_time_s", i), seed[i].nucleation_time_s);
     for (const auto& [key, seconds] : times)
       if (seconds && !std::isfinite(*seconds / s.tau0_s)) checks.fail(key, fmt::format("a time that is finite in tau0 = {:.3g} s", s.tau0_s));
     if (sized && mesh.root_blocks.has_value() == mesh.levels.has_value() && checks.has_table("flow")) {

@@ -17,6 +17,8 @@ namespace dendrift::physics {
 
 namespace {
 
+constexpr double LATEST_S = 1e30;  // in a file: finite in whatever tau0
+
 std::string trimmed(const std::string& text) {
   const auto first = text.find_first_not_of(" \t\r");
   if (first == std::string::npos) return {};
@@ -95,6 +97,7 @@ SeedOptions seed_of(const Row& row) {
   s.nucleation_time_tau0 = row.number("nucleation_time_tau0");
   if (s.nucleation_time_s && s.nucleation_time_tau0) row.fail("a nucleation time in s or in tau0", "both");
   if (s.nucleation_time_s.value_or(0) < 0 || s.nucleation_time_tau0.value_or(0) < 0) row.fail("a nucleation time >= 0", "less");
+  if (s.nucleation_time_s.value_or(0) > LATEST_S) row.fail(fmt::format("a nucleation time of {:g} s at most", LATEST_S), "more");
   if (const auto held = row.number("held")) {
     if (*held != 0 && *held != 1) row.fail("0 or 1 in column held", fmt::format("{}", *held));
     s.held = *held == 1;
