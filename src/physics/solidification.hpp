@@ -36,7 +36,7 @@ class Solidification : public Module {
 
   /// Fewest stages with which a step of dt is stable.
   int stages(double dt) const;
-  /// Largest step of a single explicit stage on a mesh of spacing dx, from diffusion.
+  /// Largest step of a single explicit stage on the finest level, from diffusion.
   double explicit_limit() const;
   /// Largest step of s stages of the phase, from the speed of the front when the mesh was last looked at.
   double sharpening_limit(int s) const;
