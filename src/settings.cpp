@@ -229,7 +229,7 @@ Settings::Settings() {
 
 std::vector<physics::SeedOptions> Settings::all_seeds(const amr::MeshShape& box, const physics::Scales& s) const {
   std::vector<physics::SeedOptions> all = seed;
-  for (const auto& more : {seeding.from_file(folder_), seeding.at_random(box, s)}) all.insert(all.end(), more.begin(), more.end());
+  for (const auto& more : {seeding.from_file(folder_, s), seeding.at_random(box, s)}) all.insert(all.end(), more.begin(), more.end());
   return all;
 }
 

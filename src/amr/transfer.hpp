@@ -54,8 +54,11 @@ inline void with_width(int width, F&& f) {
   }
 }
 
-inline void copy_box(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<const double> src, const IntVec& src_lo,
-                     const IntVec& size) {
+/// Calls f(width, d, s) with the beginnings of the rows of a box and of those in `src` that belong to them: cells of a box of the
+/// same size (ratio 1), or the first children (ratio 2).
+template <int RATIO, class F>
+inline void for_each_pair_of_rows(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<const double> src, const IntVec& src_lo,
+                                  const IntVec& size, F&& f) {
   double* d0 = dst.at(dst_lo);
   const double* s0 = src.at(src_lo);
   with_width(size[0], [&](auto width) {
@@ -64,36 +67,33 @@ inline void copy_box(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<const 
       const double* s = s0;
       for (int a = 1; a < DIM; ++a) {
         d += row[a] * dst.stride[a];
-        s += row[a] * src.stride[a];
+        s += RATIO * row[a] * src.stride[a];
       }
-      for (int i = 0; i < width; ++i) d[i] = s[i];
+      f(width, d, s);
     });
+  });
+}
+
+inline void copy_box(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<const double> src, const IntVec& src_lo,
+                     const IntVec& size) {
+  for_each_pair_of_rows<1>(dst, dst_lo, src, src_lo, size, [](auto width, double* d, const double* s) {
+    for (int i = 0; i < width; ++i) d[i] = s[i];
   });
 }
 
 /// dst cell = mean of its CHILDREN fine cells. `src_lo` is the fine cell that is the first child of dst_lo.
 inline void restrict_box(ArrayRef<double> dst, const IntVec& dst_lo, ArrayRef<const double> src,
                          const IntVec& src_lo, const IntVec& size) {
-  double* d0 = dst.at(dst_lo);
-  const double* s0 = src.at(src_lo);
   const std::ptrdiff_t y = src.stride[1];
-  with_width(size[0], [&](auto width) {
-    for_each_row(size, [&](const IntVec& row) {
-      double* d = d0;
-      const double* s = s0;
-      for (int a = 1; a < DIM; ++a) {
-        d += row[a] * dst.stride[a];
-        s += 2 * row[a] * src.stride[a];
+  for_each_pair_of_rows<2>(dst, dst_lo, src, src_lo, size, [&](auto width, double* d, const double* s) {
+    for (int i = 0; i < width; ++i, s += 2) {
+      double sum = (s[0] + s[1]) + (s[y] + s[y + 1]);
+      if constexpr (DIM == 3) {
+        const double* t = s + src.stride[2];
+        sum += (t[0] + t[1]) + (t[y] + t[y + 1]);
       }
-      for (int i = 0; i < width; ++i, s += 2) {
-        double sum = (s[0] + s[1]) + (s[y] + s[y + 1]);
-        if constexpr (DIM == 3) {
-          const double* t = s + src.stride[2];
-          sum += (t[0] + t[1]) + (t[y] + t[y + 1]);
-        }
-        d[i] = sum / CHILDREN;
-      }
-    });
+      d[i] = sum / CHILDREN;
+    }
   });
 }
 

@@ -151,6 +151,18 @@ bool Location::has_attribute(const std::string& name) const {
   return check(H5Aexists(id(), name.c_str()), path_, "look for attribute", name) > 0;
 }
 
+std::vector<std::string> Location::attribute_names() const {
+  const int count = check(H5Aget_num_attrs(id()), path_, "count attributes");
+  std::vector<std::string> names;
+  for (int i = 0; i < count; ++i) {
+    char name[256] = {};
+    check(H5Aget_name_by_idx(id(), ".", H5_INDEX_NAME, H5_ITER_INC, static_cast<hsize_t>(i), name, sizeof name, H5P_DEFAULT), path_,
+          "read the name of an attribute");
+    names.emplace_back(name);
+  }
+  return names;
+}
+
 Handle Location::open_attribute(const std::string& name) const {
   return {check(H5Aopen(id(), name.c_str(), H5P_DEFAULT), path_, "open attribute", name), H5Aclose};
 }
@@ -294,6 +306,18 @@ Dataset Group::open_dataset(const std::string& name) const {
 
 bool Group::has(const std::string& name) const {
   return check(H5Lexists(id(), name.c_str(), H5P_DEFAULT), path(), "look for", name) > 0;
+}
+
+std::vector<std::string> Group::names() const {
+  H5G_info_t info = {};
+  check(H5Gget_info(id(), &info), path(), "read a group");
+  std::vector<std::string> names;
+  for (hsize_t i = 0; i < info.nlinks; ++i) {
+    char name[256] = {};
+    check(H5Lget_name_by_idx(id(), ".", H5_INDEX_NAME, H5_ITER_INC, i, name, sizeof name, H5P_DEFAULT), path(), "read a name in a group");
+    names.emplace_back(name);
+  }
+  return names;
 }
 
 namespace {

@@ -124,6 +124,7 @@ class Location {
   void write_attribute(const std::string& name, const Type&, const Dataspace&, const void* data) const;
 
   [[nodiscard]] bool has_attribute(const std::string& name) const;
+  [[nodiscard]] std::vector<std::string> attribute_names() const;
   template <Number T>
   [[nodiscard]] T read_attribute(const std::string& name) const;
   template <Number T>
@@ -203,6 +204,8 @@ class Group : public Location {
                               std::span<const Mapping>) const;
   [[nodiscard]] Dataset open_dataset(const std::string& name) const;
   [[nodiscard]] bool has(const std::string& name) const;
+  /// Of the groups and datasets in this one.
+  [[nodiscard]] std::vector<std::string> names() const;
 
  protected:
   using Location::Location;

@@ -10,6 +10,7 @@
 #include "amr/loops.hpp"
 #include "physics/alloy_kernel.hpp"
 #include "physics/motion.hpp"
+#include "physics/recall.hpp"
 
 namespace dendrift::physics {
 

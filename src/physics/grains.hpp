@@ -7,6 +7,7 @@
 
 #include "physics/module.hpp"
 #include "physics/phase_field.hpp"
+#include "physics/recall.hpp"
 #include "physics/scales.hpp"
 #include "physics/seeds.hpp"
 

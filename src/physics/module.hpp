@@ -3,8 +3,6 @@
 /// its table stands in the input. Modules do not include each other: they meet through fields.
 #pragma once
 
-#include <cmath>
-#include <limits>
 #include <memory>
 #include <stdexcept>
 #include <vector>
@@ -63,13 +61,6 @@ class Module {
   /// The steps after the recalled state led to a failure: intervals of its own begin small.
   virtual void be_careful() {}
 };
-
-/// A count among what a module remembers. Throws std::out_of_range if no int holds it.
-inline int remembered_count(const std::vector<double>& memory, std::size_t i) {
-  const double x = memory.at(i);
-  if (!(std::abs(x) < std::numeric_limits<int>::max())) throw std::out_of_range("a count that is none");
-  return static_cast<int>(x);
-}
 
 using Modules = std::vector<std::unique_ptr<Module>>;
 

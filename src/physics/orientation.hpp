@@ -7,6 +7,7 @@
 #include "amr/scalar_solver.hpp"
 #include "io/config.hpp"
 #include "physics/module.hpp"
+#include "physics/recall.hpp"
 #include "physics/seeds.hpp"
 
 namespace dendrift::physics {

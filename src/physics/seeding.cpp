@@ -17,8 +17,6 @@ namespace dendrift::physics {
 
 namespace {
 
-constexpr double LATEST_S = 1e30;  // in a file: finite in whatever tau0
-
 std::string trimmed(const std::string& text) {
   const auto first = text.find_first_not_of(" \t\r");
   if (first == std::string::npos) return {};
@@ -73,7 +71,7 @@ const std::vector<std::string>& known_columns() {
   return names;
 }
 
-SeedOptions seed_of(const Row& row) {
+SeedOptions seed_of(const Row& row, const Scales& scales) {
   SeedOptions s;
   RealVec um{}, w0{};
   int in_um = 0, in_w0 = 0;
@@ -97,7 +95,8 @@ SeedOptions seed_of(const Row& row) {
   s.nucleation_time_tau0 = row.number("nucleation_time_tau0");
   if (s.nucleation_time_s && s.nucleation_time_tau0) row.fail("a nucleation time in s or in tau0", "both");
   if (s.nucleation_time_s.value_or(0) < 0 || s.nucleation_time_tau0.value_or(0) < 0) row.fail("a nucleation time >= 0", "less");
-  if (s.nucleation_time_s.value_or(0) > LATEST_S) row.fail(fmt::format("a nucleation time of {:g} s at most", LATEST_S), "more");
+  if (const double time = s.nucleation_time_s.value_or(0); !std::isfinite(time / scales.tau0_s))
+    row.fail(fmt::format("a nucleation time that is finite in tau0 = {:.3g} s", scales.tau0_s), fmt::format("{:g} s", time));
   if (const auto held = row.number("held")) {
     if (*held != 0 && *held != 1) row.fail("0 or 1 in column held", fmt::format("{}", *held));
     s.held = *held == 1;
@@ -237,7 +236,7 @@ std::vector<SeedOptions> SeedingOptions::at_random(const amr::MeshShape& shape, 
   return seeds;
 }
 
-std::vector<SeedOptions> SeedingOptions::from_file(const std::string& folder) const {
+std::vector<SeedOptions> SeedingOptions::from_file(const std::string& folder, const Scales& scales) const {
   std::vector<SeedOptions> seeds;
   if (file.empty()) return seeds;
   const std::filesystem::path path = std::filesystem::path(folder) / file;  // an absolute one stays
@@ -262,7 +261,7 @@ std::vector<SeedOptions> SeedingOptions::from_file(const std::string& folder) co
     if (fields.size() != header.size())
       throw SeedingProblem("seeds.file", fmt::format("{}: {} fields, as in the header", where, header.size()),
                            fmt::format("{}", fields.size()));
-    seeds.push_back(seed_of(Row(header, fields, where)));
+    seeds.push_back(seed_of(Row(header, fields, where), scales));
   }
   if (header.empty()) throw SeedingProblem("seeds.file", path.string() + ": a header line", "an empty file");
   return seeds;

@@ -36,7 +36,7 @@ struct SeedingOptions {
   std::vector<SeedOptions> at_random(const amr::MeshShape& shape, const Scales& scales) const;
   /// Rows of a CSV file with a header: x_um, y_um[, z_um], radius_um, and as wanted angle_deg (2D), euler1_deg, euler2_deg,
   /// euler3_deg (3D), nucleation_time_s, held. W0 and tau0 in place of um and s are understood. Relative to `folder`.
-  std::vector<SeedOptions> from_file(const std::string& folder) const;
+  std::vector<SeedOptions> from_file(const std::string& folder, const Scales& scales) const;
 
  private:
   static constexpr RealVec filled_real(double x) {

@@ -5,6 +5,8 @@
 #include <numbers>
 #include <stdexcept>
 
+#include "physics/recall.hpp"
+
 namespace dendrift::physics {
 
 namespace {
@@ -266,7 +268,7 @@ void recall(Seed& c, std::span<const double> m) {
   take(c.spin);
   for (RealVec& axis : c.axes) take(axis);
   for (bool* b : {&c.rotated, &c.touching, &c.present, &c.refused}) *b = *next++ != 0;
-  c.contacts = static_cast<int>(*next++);
+  c.contacts = remembered_count(m, static_cast<std::size_t>(next++ - m.begin()));
   c.angle = *next++;
   c.volume = *next++;
   c.nonrigidity = *next++;

@@ -3,16 +3,20 @@
 #include <unistd.h>
 
 #include <cmath>
+#include <csignal>
 #include <filesystem>
 #include <fstream>
 #include <limits>
+#include <stdexcept>
 #include <string>
 #include <vector>
 
 #include "io/config.hpp"
 #include "io/crc32.hpp"
 #include "io/seal.hpp"
-#include "physics/module.hpp"
+#include "io/trial.hpp"
+#include "physics/recall.hpp"
+#include "physics/seeds.hpp"
 
 namespace dendrift::test {
 namespace {
@@ -126,12 +130,28 @@ TEST(InputChanges, KeysOfAnotherVersion) {
   EXPECT_EQ(gone[0].key + gone[0].before + gone[0].after, "t.old5unknown to this version");
 }
 
+TEST(Trial, SaysWhatKillsWork) {
+  int there = 0;
+  EXPECT_EQ(io::what_kills([&] { there = 1; }, 60), "");
+  EXPECT_EQ(there, 0) << "a trial changes nothing here";
+  EXPECT_EQ(io::what_kills([] { throw std::runtime_error("no"); }, 60), "");
+  EXPECT_EQ(io::what_kills([] { std::raise(SIGSEGV); }, 60), "Segmentation fault");
+  EXPECT_EQ(io::what_kills([] { std::abort(); }, 60), "Aborted");
+  EXPECT_EQ(io::what_kills([] { _exit(7); }, 60), "it ends with exit code 7");
+  EXPECT_EQ(io::what_kills([] { while (true) pause(); }, 1), "it takes more than 1 s");
+}
+
 // Found by libFuzzer: a count of a module that no int holds.
 TEST(Memory, CountsThatNoIntHoldsAreRefused) {
   const std::vector<double> memory{3, -7, 1e10, -1e300, std::nan(""), std::numeric_limits<double>::infinity()};
   EXPECT_EQ(physics::remembered_count(memory, 0), 3);
   EXPECT_EQ(physics::remembered_count(memory, 1), -7);
   for (std::size_t i = 2; i < memory.size() + 1; ++i) EXPECT_THROW(physics::remembered_count(memory, i), std::out_of_range) << i;
+  physics::Seed crystal;
+  std::vector<double> of_crystal = physics::memory(crystal);
+  physics::recall(crystal, of_crystal);
+  of_crystal[of_crystal.size() - 4] = -1e308;  // contacts
+  EXPECT_THROW(physics::recall(crystal, of_crystal), std::out_of_range);
 }
 
 }  // namespace

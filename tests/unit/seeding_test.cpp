@@ -147,7 +147,7 @@ class SeedFile : public ::testing::Test {
     std::ofstream(folder_ / "seeds.csv") << text;
     SeedingOptions o;
     o.file = "seeds.csv";
-    return o.from_file(folder_.string());
+    return o.from_file(folder_.string(), physics::Scales(physics::AlloyOptions{}));
   }
   std::string problem(const std::string& text) {
     try {
@@ -191,10 +191,11 @@ TEST_F(SeedFile, MistakesAreNamedWithTheirLine) {
   EXPECT_TRUE(mentions(problem(XYZ + ",radius_um,colour\n"), {"columns among", "colour"}));
   EXPECT_TRUE(mentions(problem(XYZ + ",radius_um,radius_um\n"), {"each once"}));
   EXPECT_TRUE(mentions(problem(head.substr(0, head.size() - 1) + ",held\n" + POINT + ",1,2\n"), {"0 or 1"}));
+  EXPECT_TRUE(mentions(problem(head.substr(0, head.size() - 1) + ",nucleation_time_s\n" + POINT + ",1,1e308\n"), {"seeds.csv:2", "finite in tau0"}));
   EXPECT_TRUE(mentions(problem(""), {"empty file"}));
   SeedingOptions o;
   o.file = "none.csv";
-  EXPECT_THROW(o.from_file(folder_.string()), SeedingProblem);
+  EXPECT_THROW(o.from_file(folder_.string(), physics::Scales(physics::AlloyOptions{})), SeedingProblem);
 }
 
 }  // namespace
