@@ -13,8 +13,9 @@ namespace {
 
 constexpr int TAG = 120;
 constexpr int G = Layout::GHOSTS;
-constexpr int COARSEST_CELLS = 2;
-constexpr std::int64_t DIRECT_CELLS = 600;  // that the last grid may have
+constexpr int COARSEST_CELLS = 2;  // of a node along an axis
+
+constexpr std::int64_t DIRECT_CELLS = DIM == 2 ? 1024 : 512;  // that the last grid may have
 
 std::size_t at(int i) { return static_cast<std::size_t>(i); }
 
@@ -37,6 +38,8 @@ int towards(int axis, int step) {
   o[axis] = step;
   return direction_index(o);
 }
+
+std::int64_t cells_of(const Grid& g) { return volume(g.extent) * volume(filled(g.layout.n)); }
 
 // A node beside a coarser leaf, and that leaf: parents never are, or levels would differ by two.
 const Grid::Node& leaf_beyond(const Grid::Node& n, int face, const Grid& coarse) {
@@ -157,11 +160,11 @@ void HierarchyField::clear(int g) {
 
 Hierarchy::Hierarchy(const Mesh& mesh) : mesh_(mesh), rank_(mesh.rank()) {
   add_level_grids();
-  add_grids_beneath();
-  routes_.resize(grids_.size());
-  for (int g = 0; g < grids(); ++g) connect(g);
   for (int g = 0; g < levels_; ++g)
     if (std::ranges::any_of(grid(g).nodes, [](const Grid::Node& n) { return n.leaf >= 0; })) coarsest_leaf_ = g;
+  if (!end_at_level()) add_grids_beneath();
+  routes_.resize(grids_.size());
+  for (int g = 0; g < grids(); ++g) connect(g);
   for (int g = 0; g < grids(); ++g) build_routes(g);
   places_.resize(at(mesh.size()));
   for (int g = 0; g < levels_; ++g)
@@ -207,9 +210,24 @@ void Hierarchy::add_level_grids() {
   }
 }
 
+// Ends the ladder at the first level beneath all leaves that has few enough cells. False: there is none.
+bool Hierarchy::end_at_level() {
+  for (int g = coarsest_leaf_ + 1; g < levels_; ++g) {
+    if (cells_of(grid(g)) > DIRECT_CELLS) continue;
+    levels_ = g + 1;
+    grids_.resize(at(levels_));
+    for (Grid::Node& n : grids_.back().nodes) {
+      n.owner = 0;
+      n.parent = -1;
+    }
+    return true;
+  }
+  return false;
+}
+
 // So few cells that one rank solves them faster alone than all by messages: roots of fewer and fewer cells, then groups
-// of roots as if the tree went on. Not further than a direct solution asks for: the coarser the last grid, the less it
-// knows of small solids.
+// of roots as if the tree went on. Not further than a direct solution asks for: solids that the last grids do not resolve
+// cost iterations, the more the stiffer they are.
 void Hierarchy::add_grids_beneath() {
   const auto halved = [](Grid g) {
     for (Grid::Node& n : g.nodes) {
@@ -220,15 +238,14 @@ void Hierarchy::add_grids_beneath() {
     g.dx *= 2;
     return g;
   };
-  while (grids_.back().layout.n / 2 >= COARSEST_CELLS) {
+  while (grids_.back().layout.n / 2 >= COARSEST_CELLS && (grids() == levels_ || cells_of(grids_.back()) > DIRECT_CELLS)) {
     Grid g = halved(grids_.back());
     for (std::size_t i = 0; i < g.nodes.size(); ++i) grids_.back().nodes[i].parent = static_cast<int>(i);
     g.layout.n /= 2;
     grids_.push_back(std::move(g));
   }
   const auto even = [](int e) { return e % 2 == 0; };
-  const auto cells = [](const Grid& g) { return volume(g.extent) * volume(filled(g.layout.n)); };
-  while (cells(grids_.back()) > DIRECT_CELLS && std::ranges::all_of(grids_.back().extent, even)) {
+  while (cells_of(grids_.back()) > DIRECT_CELLS && std::ranges::all_of(grids_.back().extent, even)) {
     Grid& fine = grids_.back();
     Grid g = halved(fine);
     g.nodes.clear();
@@ -816,17 +833,18 @@ void Hierarchy::restrict_links(HierarchyField& f, int g) {
   });
 }
 
-void Hierarchy::restrict_roots(HierarchyField& f, int g) {
+void Hierarchy::restrict_roots(HierarchyField& f, int g, std::span<const IntVec> shift) {
   const Layout& layout = grid(g).layout;
   const IntVec size = filled(layout.n / 2);
+  const int components = static_cast<int>(shift.size());
   const auto local = [&](const Item& item) { return grid(g).nodes[at(item.src)].local; };
   const auto place = [&](const Item& item) { return grid(g).nodes[at(item.src)].place; };
-  const auto quadrant = [&](int i, const ArrayRef<double>& dst, const IntVec& lo) {
+  const auto quadrant = [&](int i, int c, const ArrayRef<double>& dst, const IntVec& lo) {
     const ArrayRef<const double> x = std::as_const(f).ref(g, i, 0);
     for_each_cell({}, size, [&](const IntVec& q) {
       IntVec fine{}, coarse{};
       for (int a = 0; a < DIM; ++a) {
-        fine[a] = 2 * q[a];
+        fine[a] = 2 * q[a] - shift[at(c)][a];
         coarse[a] = lo[a] + q[a];
       }
       const double* p = x.at(fine);
@@ -840,12 +858,17 @@ void Hierarchy::restrict_roots(HierarchyField& f, int g) {
     });
   };
   run(
-      routes_[at(g)].to_parent, [&](const Item&) { return volume(size); },
-      [&](const Item& item, double* p) { quadrant(local(item), packed_ref(p, size), {}); },
-      [&](const Item& item, const double* p) {
-        copy_box(f.ref(g + 1, item.dst, 0), place(item), packed_ref(p, size), {}, size);
+      routes_[at(g)].to_parent, [&](const Item&) { return components * volume(size); },
+      [&](const Item& item, double* p) {
+        for (int c = 0; c < components; ++c, p += volume(size)) quadrant(local(item), c, packed_ref(p, size), {});
       },
-      [&](const Item& item) { quadrant(local(item), f.ref(g + 1, item.dst, 0), place(item)); });
+      [&](const Item& item, const double* p) {
+        for (int c = 0; c < components; ++c, p += volume(size))
+          copy_box(f.ref(g + 1, item.dst, c), place(item), packed_ref(p, size), {}, size);
+      },
+      [&](const Item& item) {
+        for (int c = 0; c < components; ++c) quadrant(local(item), c, f.ref(g + 1, item.dst, c), place(item));
+      });
 }
 
 void Hierarchy::restrict_made(const std::function<ArrayRef<const double>(int)>& array, HierarchyField& to, int g) {

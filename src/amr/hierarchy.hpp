@@ -7,6 +7,7 @@
 
 #include <array>
 #include <functional>
+#include <span>
 #include <vector>
 
 #include "amr/mesh.hpp"
@@ -112,8 +113,10 @@ struct Range {
   IntVec lo{}, size{};
 };
 
-/// Grid 0 is the finest level of the tree; grid levels()-1 the roots; then roots of half the cells, down to 2; then groups
-/// of roots while they are many and their number is even along every axis.
+/// Grid 0 is the finest level of the tree; the next ones are coarser levels, down to the first beneath all leaves that has
+/// few enough cells for a direct solution. Where there is none: down to the roots, then roots of half the cells, once at
+/// least and while they are many, down to 2; then groups of roots while their number is even along every axis. The last grid
+/// is rank 0's.
 class Hierarchy {
  public:
   explicit Hierarchy(const Mesh& mesh);
@@ -146,8 +149,9 @@ class Hierarchy {
   /// along the normal alone), of a vector. made(local node): arrays of its components and of the plane below their
   /// first faces, made when they are asked for.
   void restrict_weighted(const std::function<Array<ArrayRef<const double>>(int i)>& made, HierarchyField& to, int g);
-  /// Component 0 (cells) of parents in grid g+1 = the square of the mean of the roots of the finer cells.
-  void restrict_roots(HierarchyField& f, int g);
+  /// Component c of parents in grid g+1 = the square of the mean of the roots of component 0 (cells) of grid g, of the
+  /// CHILDREN cells that begin shift[c] (0 or 1 along each axis) below the first child. Ghosts of grid g must be filled.
+  void restrict_roots(HierarchyField& f, int g, std::span<const IntVec> shift);
   /// Faces of parents in grid g+1 as conductors: finer ones in series across the plane, side by side along it. Low planes of
   /// leaves take means, as restrict_means. Ghosts of grid g must be filled.
   void restrict_links(HierarchyField& f, int g);
@@ -193,6 +197,7 @@ class Hierarchy {
     Route same, from_parent, ghosts_from_parent, to_parent, to_plane, to_border;
   };
   void add_level_grids();
+  bool end_at_level();
   void add_grids_beneath();
   void connect(int g);
   void build_routes(int g);

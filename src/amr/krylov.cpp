@@ -8,7 +8,13 @@
 namespace dendrift::amr {
 
 namespace {
+
+// Squared shares of a new direction that the earlier ones leave: one that loses more digits is made orthogonal once more; and
+// one of which only rounding is left is none.
+constexpr double LITTLE = 1e-6, NOTHING = 1e-24;
+
 std::size_t at(int i) { return static_cast<std::size_t>(i); }
+
 }  // namespace
 
 std::vector<double> Pieces::products(const std::vector<double>& v, std::span<const std::vector<double>> with) const {
@@ -191,42 +197,10 @@ GcrResult Gcr::solve(Vector& x, Vector& r, const Pieces& pieces, const GcrOption
     std::vector<std::size_t> with;
     for (std::size_t k = 1; k <= known; ++k) with.push_back((now + slots - k) % slots);
     const std::size_t products = known + 2;
-    partial.resize(at(count_of_pieces) * products);
-    for_pieces([&](int i, std::size_t begin, std::size_t end) {
-      const double *w = w_[now].data(), *weight = pieces.weight.data();
-      const auto product = [&](const double* v) {
-        double sum = 0;
-        if (pieces.alike) {
-#pragma omp simd reduction(+ : sum)
-          for (std::size_t q = begin; q < end; ++q) sum += w[q] * v[q];
-          return sum * weight[begin];
-        }
-#pragma omp simd reduction(+ : sum)
-        for (std::size_t q = begin; q < end; ++q) sum += weight[q] * w[q] * v[q];
-        return sum;
-      };
-      double* p = partial.data() + at(i) * products;
-      *p++ = product(w);
-      *p++ = product(r.data());
-      for (const std::size_t j : with) *p++ = product(w_[j].data());
-    });
-    const std::vector<double> p = sum_up(products);
-    double square = p[0];
-    std::vector<double> along(with.size());
-    for (std::size_t k = 0; k < with.size(); ++k) {
-      along[k] = p[k + 2] / length[with[k]];
-      square -= along[k] * p[k + 2];
-    }
-    if (!(square > 1e-12 * p[0])) {  // nothing new: forget the rest
-      if (known == 0) break;
-      known = 0;
-      continue;
-    }
-    length[now] = square;
-    const double step = p[1] / square;  // r is orthogonal to the others already
-    partial.resize(at(count_of_pieces));
-    for_pieces([&](int i, std::size_t begin, std::size_t end) {
-      double *w = w_[now].data(), *z = z_[now].data(), *px = x.data(), *pr = r.data();
+    std::vector<double> p, along(with.size());
+    double square = 0, first = 0;  // what w keeps of its length, and had
+    const auto subtract = [&](std::size_t begin, std::size_t end) {
+      double *w = w_[now].data(), *z = z_[now].data();
       for (std::size_t k = 0; k < with.size(); ++k) {
         const double *u = w_[with[k]].data(), *v = z_[with[k]].data(), a = along[k];
 #pragma omp simd
@@ -235,6 +209,51 @@ GcrResult Gcr::solve(Vector& x, Vector& r, const Pieces& pieces, const GcrOption
           z[q] -= a * v[q];
         }
       }
+    };
+    // Twice where little is left: what rounding leaves of the others in w would spoil all that follows.
+    for (bool again : {false, true}) {
+      partial.resize(at(count_of_pieces) * products);
+      for_pieces([&](int i, std::size_t begin, std::size_t end) {
+        const double *w = w_[now].data(), *weight = pieces.weight.data();
+        const auto product = [&](const double* v) {
+          double sum = 0;
+          if (pieces.alike) {
+#pragma omp simd reduction(+ : sum)
+            for (std::size_t q = begin; q < end; ++q) sum += w[q] * v[q];
+            return sum * weight[begin];
+          }
+#pragma omp simd reduction(+ : sum)
+          for (std::size_t q = begin; q < end; ++q) sum += weight[q] * w[q] * v[q];
+          return sum;
+        };
+        double* to = partial.data() + at(i) * products;
+        *to++ = product(w);
+        *to++ = product(r.data());
+        for (const std::size_t j : with) *to++ = product(w_[j].data());
+      });
+      p = sum_up(products);
+      square = p[0];
+      for (std::size_t k = 0; k < with.size(); ++k) {
+        along[k] = p[k + 2] / length[with[k]];
+        square -= along[k] * p[k + 2];
+      }
+      if (again) break;
+      first = p[0];
+      if (square > LITTLE * first) break;
+      for_pieces([&](int, std::size_t begin, std::size_t end) { subtract(begin, end); });
+    }
+    if (!(square > NOTHING * first)) {  // nothing new: forget the rest
+      if (known == 0) break;
+      known = 0;
+      continue;
+    }
+    length[now] = square;
+    const double step = p[1] / square;  // r is orthogonal to the others already
+    partial.resize(at(count_of_pieces));
+    for_pieces([&](int i, std::size_t begin, std::size_t end) {
+      subtract(begin, end);
+      const double *w = w_[now].data(), *z = z_[now].data();
+      double *px = x.data(), *pr = r.data();
 #pragma omp simd
       for (std::size_t q = begin; q < end; ++q) {
         px[q] += step * z[q];

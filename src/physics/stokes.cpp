@@ -127,12 +127,15 @@ void StokesSolver::set_viscosity(const std::function<void(int, double*)>& phase,
     });
   };
   for_leaves([&](int b, int g, int i, double) { fill_leaf(b, g, i); });
+  std::array<IntVec, 1 + EDGES> below{};  // where the finer cells round an edge begin
+  for (int a = 0; a < DIM; ++a)
+    for (int e = a + 1; e < DIM; ++e) below[at(edge_component(a, e))][a] = below[at(edge_component(a, e))][e] = 1;
   for (int g = 0; g + 1 < hierarchy_.grids(); ++g) {
     const Grid& coarse = hierarchy_.grid(g + 1);
-    // The square of the mean of square roots. Iterations from rest to 1e-5, ratio 1e6, for a disc (R = 80), a cross
-    // (half width 10) and a seed (R = 10) in a wide box: this one 22, 20, 20; arithmetic means 22, 19, 26; geometric
-    // ones bend solids (27, 36 at 1e-4 already).
-    hierarchy_.restrict_roots(viscosity_, g);
+    // The square of the mean of square roots: of the children, and of the finer cells round an edge. Means of the coarse cells
+    // round an edge reach as far again and make solids thicker on every grid (velocities alone, a disc of 512^2, at 1e4 and 1e6:
+    // 14, 17 iterations for 11, 13). Arithmetic and geometric means of cells were no better.
+    hierarchy_.restrict_roots(viscosity_, g, below);
     hierarchy_.exchange(viscosity_, g + 1, Layout::GHOSTS);
     amr::parallel_for(coarse.size(), [&](int i) {
       const Grid::Node& n = coarse.mine(i);
@@ -146,9 +149,8 @@ void StokesSolver::set_viscosity(const std::function<void(int, double*)>& phase,
   set_up_pieces();
 }
 
-// A parent's cells where a coarser leaf lies, as the nearest, and all its edges, from its cells. An arithmetic mean
-// there costs iterations (coupled, 1e4: 23 for 21). Roots of the finer cells round an edge: fewer at 1e4, twice as
-// many or no end at 1e8.
+// A parent's cells where a coarser leaf lies, as the nearest, and its edges there and beyond the sides, from its cells: finer
+// ones do not surround them.
 void StokesSolver::extend_viscosity(int g, int i) {
   const Grid::Node& n = hierarchy_.grid(g).mine(i);
   const Layout& layout = hierarchy_.grid(g).layout;
@@ -167,11 +169,24 @@ void StokesSolver::extend_viscosity(int g, int i) {
       nu[layout.offset(c)] = nu[layout.offset(near)];
     });
   }
+  // Whether all cells round an edge of the plane (a, e) lie in nodes of this grid.
+  const auto among_nodes = [&](const IntVec& c, int a, int e) {
+    const auto step = [&](int k) { return k < 0 ? -1 : k >= layout.n ? 1 : 0; };
+    for (int corner = 0; corner < 4; ++corner) {
+      IntVec o = c;
+      o[a] -= corner & 1;
+      o[e] -= corner >> 1;
+      for (int& k : o) k = step(k);
+      if (o != IntVec{} && n.neighbours[at(direction_index(o))] < 0) return false;
+    }
+    return true;
+  };
   for (int a = 0; a < DIM; ++a)
     for (int e = a + 1; e < DIM; ++e) {
       double* edge = viscosity_.at(g, i, edge_component(a, e));
       const std::ptrdiff_t s = layout.stride(a), t = layout.stride(e);
       amr::for_each_cell(filled(1 - Layout::GHOSTS), filled(layout.pitch() - 1), [&](const IntVec& c) {
+        if (among_nodes(c, a, e)) return;
         const double* p = nu + layout.offset(c);
         const double mean = 0.25 * ((std::sqrt(p[0]) + std::sqrt(p[-s])) + (std::sqrt(p[-t]) + std::sqrt(p[-s - t])));
         edge[layout.offset(c)] = mean * mean;
