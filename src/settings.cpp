@@ -217,13 +217,17 @@ Settings::Settings() {
     if (checks.has_table("flow") && held > 0 && held < std::ssize(seeds) && flow.solid == physics::SolidModel::viscous &&
         flow.motion == physics::Motion::free)
       checks.fail("flow.solid", "\"penalised\", where some crystals are held and others free", "\"viscous\"");
-    for (std::size_t i = 0; i < seeds.size(); ++i)
-      for (int a = 0; a < DIM; ++a) {
-        if (seeds[i].position[a] >= 0 && seeds[i].position[a] <= size[a]) continue;
-        const bool listed = i < seed.size();
-        checks.fail(listed ? "seed[" + std::to_string(i) + "]." + (seed[i].position_w0 ? "position_W0" : "position_um") : "seeds.file",
-                    listed ? "a point inside the box" : fmt::format("points inside the box; seed {} of the file is not", i - seed.size() + 1));
-      }
+    for (std::size_t i = 0; i < seeds.size(); ++i) {
+      const auto fail = [&](const std::string& key, const std::string& expected) {
+        if (i < seed.size()) checks.fail(fmt::format("seed[{}].{}", i, key), expected);
+        if (i >= seed.size()) checks.fail("seeds.file", fmt::format("{}; seed {} of the file differs", expected, i - seed.size() + 1));
+      };
+      if (!std::isfinite(seeds[i].radius) || seeds[i].radius <= 0)
+        fail(all[i].radius_w0 ? "radius_W0" : "radius_um", fmt::format("a radius that is a positive number of W0 = {:.3g} um", s.w0_um));
+      for (int a = 0; a < DIM; ++a)
+        if (!(seeds[i].position[a] >= 0 && seeds[i].position[a] <= size[a]))
+          fail(all[i].position_w0 ? "position_W0" : "position_um", "a point inside the box");
+    }
   });
 }
 
