@@ -109,9 +109,12 @@ void CoarserMesh::take(const FieldList& fields) {
     for (const int row : list)
       copy_box(ref(row, coarse), {}, {fine_ref(row, fine).p, fine_ref(row, fine).stride}, {}, extent(row));
   });
+  // A family at a time, by its first child: siblings write the faces between them both.
   parallel_for(static_cast<int>(local_.size()), [&](int i) {
-    const Child& c = local_[at(i)];
-    for (const int row : list) restrict_child(row, c, ref(row, c.parent), c.corner);
+    const int parent = local_[at(i)].parent;
+    if (i > 0 && local_[at(i - 1)].parent == parent) return;
+    for (auto c = local_.begin() + i; c != local_.end() && c->parent == parent; ++c)
+      for (const int row : list) restrict_child(row, *c, ref(row, parent), c->corner);
   });
   send(
       children_, parents_, each,
