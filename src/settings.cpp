@@ -219,8 +219,11 @@ Settings::Settings() {
       checks.fail("flow.solid", "\"penalised\", where some crystals are held and others free", "\"viscous\"");
     for (std::size_t i = 0; i < seeds.size(); ++i) {
       const auto fail = [&](const std::string& key, const std::string& expected) {
-        if (i < seed.size()) checks.fail(fmt::format("seed[{}].{}", i, key), expected);
-        if (i >= seed.size()) checks.fail("seeds.file", fmt::format("{}; seed {} of the file differs", expected, i - seed.size() + 1));
+        if (i < seed.size()) {
+          checks.fail(fmt::format("seed[{}].{}", i, key), expected);
+        } else {
+          checks.fail("seeds.file", fmt::format("{}; seed {} of the file differs", expected, i - seed.size() + 1));
+        }
       };
       if (!std::isfinite(seeds[i].radius) || seeds[i].radius <= 0)
         fail(all[i].radius_w0 ? "radius_W0" : "radius_um", fmt::format("a radius that is a positive number of W0 = {:.3g} um", s.w0_um));

@@ -14,7 +14,6 @@ namespace {
 constexpr int TAG = 120;
 constexpr int G = Layout::GHOSTS;
 constexpr int COARSEST_CELLS = 2;  // of a node along an axis
-
 constexpr std::int64_t DIRECT_CELLS = DIM == 2 ? 1024 : 512;  // that the last grid may have
 
 std::size_t at(int i) { return static_cast<std::size_t>(i); }

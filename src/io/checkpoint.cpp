@@ -206,7 +206,7 @@ namespace {
 
 constexpr int TRIAL_SECONDS = 300;  // to open a file and to read all but the fields
 
-// All but input, leaves and fields; the format is that of the file.
+// All but leaves and fields; the format is what the file says.
 RunState state_of(const File& file) {
   if (!file.has_attribute("format") || !file.has("leaves"))
     throw OutputError(file.path(), "restart", "this is not a checkpoint of Dendrift");

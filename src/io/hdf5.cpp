@@ -151,16 +151,27 @@ bool Location::has_attribute(const std::string& name) const {
   return check(H5Aexists(id(), name.c_str()), path_, "look for attribute", name) > 0;
 }
 
-std::vector<std::string> Location::attribute_names() const {
-  const int count = check(H5Aget_num_attrs(id()), path_, "count attributes");
+namespace {
+
+// get(i, name, room): one of HDF5's functions that copy a name.
+template <class Get>
+std::vector<std::string> names_by_index(hsize_t count, const std::string& path, Get&& get) {
   std::vector<std::string> names;
-  for (int i = 0; i < count; ++i) {
+  for (hsize_t i = 0; i < count; ++i) {
     char name[256] = {};
-    check(H5Aget_name_by_idx(id(), ".", H5_INDEX_NAME, H5_ITER_INC, static_cast<hsize_t>(i), name, sizeof name, H5P_DEFAULT), path_,
-          "read the name of an attribute");
+    check(get(i, name, sizeof name), path, "read a name");
     names.emplace_back(name);
   }
   return names;
+}
+
+}  // namespace
+
+std::vector<std::string> Location::attribute_names() const {
+  const int count = check(H5Aget_num_attrs(id()), path_, "count attributes");
+  return names_by_index(static_cast<hsize_t>(count), path_, [&](hsize_t i, char* name, std::size_t size) {
+    return H5Aget_name_by_idx(id(), ".", H5_INDEX_NAME, H5_ITER_INC, i, name, size, H5P_DEFAULT);
+  });
 }
 
 Handle Location::open_attribute(const std::string& name) const {
@@ -311,13 +322,9 @@ bool Group::has(const std::string& name) const {
 std::vector<std::string> Group::names() const {
   H5G_info_t info = {};
   check(H5Gget_info(id(), &info), path(), "read a group");
-  std::vector<std::string> names;
-  for (hsize_t i = 0; i < info.nlinks; ++i) {
-    char name[256] = {};
-    check(H5Lget_name_by_idx(id(), ".", H5_INDEX_NAME, H5_ITER_INC, i, name, sizeof name, H5P_DEFAULT), path(), "read a name in a group");
-    names.emplace_back(name);
-  }
-  return names;
+  return names_by_index(info.nlinks, path(), [&](hsize_t i, char* name, std::size_t size) {
+    return H5Lget_name_by_idx(id(), ".", H5_INDEX_NAME, H5_ITER_INC, i, name, size, H5P_DEFAULT);
+  });
 }
 
 namespace {

@@ -21,7 +21,7 @@ constexpr int CRASHES[] = {SIGSEGV, SIGBUS, SIGABRT, SIGFPE, SIGILL};
   // MPI's and a sanitizer's own handlers would fill the output with a crash that is expected here.
   for (const int s : CRASHES) std::signal(s, SIG_DFL);
   std::signal(SIGALRM, SIG_DFL);
-  if (seconds > 0) alarm(static_cast<unsigned>(seconds));
+  alarm(static_cast<unsigned>(seconds));
   try {
     work();
   } catch (const std::exception&) {  // as the caller will see when it does the work itself
@@ -39,7 +39,8 @@ std::string what_kills(const std::function<void()>& work, int seconds) {
   while (waitpid(child, &status, 0) < 0) {
     if (errno != EINTR) return "";
   }
-  if (WIFSIGNALED(status)) return WTERMSIG(status) == SIGALRM ? "it takes more than " + std::to_string(seconds) + " s" : strsignal(WTERMSIG(status));
+  if (WIFSIGNALED(status) && WTERMSIG(status) == SIGALRM) return "it takes more than " + std::to_string(seconds) + " s";
+  if (WIFSIGNALED(status)) return strsignal(WTERMSIG(status));
   return WEXITSTATUS(status) == 0 ? "" : "it ends with exit code " + std::to_string(WEXITSTATUS(status));
 }
 

@@ -153,6 +153,7 @@ void StokesSolver::set_viscosity(const std::function<void(int, double*)>& phase,
 // ones do not surround them.
 void StokesSolver::extend_viscosity(int g, int i) {
   const Grid::Node& n = hierarchy_.grid(g).mine(i);
+  if (std::ranges::all_of(n.neighbours, [](int m) { return m >= 0; })) return;
   const Layout& layout = hierarchy_.grid(g).layout;
   double* nu = viscosity_.at(g, i, 0);
   for (int d = 0; d < DIRECTIONS; ++d) {
