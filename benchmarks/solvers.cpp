@@ -11,6 +11,7 @@ namespace dendrift::bench {
 namespace {
 
 constexpr int UNIFORM = DIM == 2 ? 1024 : 64;
+constexpr int LEVELS = DIM == 2 ? 4 : 2;
 constexpr double RADIUS = 0.2;
 
 double from_centre(const RealVec& x) {
@@ -200,14 +201,14 @@ void scalar(benchmark::State& state, int levels, double ratio, Beside beside) {
   state.counters["ratio_max"] = greatest(ratios);
 }
 
-// (1/dt - div 2 nu D) v = f on a uniform grid, dt nu/dx^2 = 500 where nu = 1; nu in the disc is `ratio`. With the pressure:
-// the coupled system.
+// (1/dt - div 2 nu D) v = f, dt nu/dx^2 = 500 where nu = 1; nu in the disc is `ratio`. With the pressure: the coupled system. On
+// a uniform grid, or with so many levels round the surface.
 enum class Unknowns { velocity, all };
 
-void viscous(benchmark::State& state, Unknowns unknowns) {
+void viscous(benchmark::State& state, Unknowns unknowns, int levels) {
   constexpr int CELLS_ALONG = DIM == 2 ? 512 : 64, BLOCK = 16;
   const double ratio = static_cast<double>(state.range(0));
-  const amr::Mesh mesh = unit_box(CELLS_ALONG, 0, BLOCK);
+  const amr::Mesh mesh = unit_box(CELLS_ALONG >> levels, levels, BLOCK);
   const double dx = 1.0 / CELLS_ALONG, sigma = 1 / (500 * dx * dx);
   physics::StokesOptions options;
   options.tolerance = unknowns == Unknowns::velocity ? 1e-8 : 1e-6;
@@ -216,7 +217,7 @@ void viscous(benchmark::State& state, Unknowns unknowns) {
       [&](int b, double* phi) {
         amr::for_each_cell(filled(-amr::Layout::GHOSTS), filled(mesh.layout().pitch()), [&](const IntVec& q) {
           RealVec x{};
-          for (int a = 0; a < DIM; ++a) x[a] = mesh.block(b).lo[a] + (q[a] + 0.5) * dx;
+          for (int a = 0; a < DIM; ++a) x[a] = mesh.block(b).lo[a] + (q[a] + 0.5) * mesh.block(b).dx;
           phi[mesh.layout().offset(q)] = std::tanh((RADIUS - from_centre(x)) / (2 * dx));
         });
       },
@@ -250,17 +251,19 @@ void solutions(benchmark::internal::Benchmark* b) {
 }
 
 BENCHMARK_CAPTURE(scalar, uniform, 0, 1.0, Beside::pfmg)->Name("multigrid_uniform")->Apply(solutions);
-BENCHMARK_CAPTURE(scalar, levels, DIM == 2 ? 4 : 2, 1.0, Beside::nothing)->Name("multigrid_levels")->Apply(solutions);
+BENCHMARK_CAPTURE(scalar, levels, LEVELS, 1.0, Beside::nothing)->Name("multigrid_levels")->Apply(solutions);
 BENCHMARK_CAPTURE(scalar, uniform_beta, 0, 1e3, Beside::pfmg)->Name("multigrid_uniform_beta")->Apply(solutions);
-BENCHMARK_CAPTURE(scalar, levels_beta, DIM == 2 ? 4 : 2, 1e3, Beside::nothing)->Name("multigrid_levels_beta")->Apply(solutions);
+BENCHMARK_CAPTURE(scalar, levels_beta, LEVELS, 1e3, Beside::nothing)->Name("multigrid_levels_beta")->Apply(solutions);
 
 void ratios(benchmark::internal::Benchmark* b) {
   b->UseManualTime()->Repetitions(1)->Iterations(5)->Unit(benchmark::kMillisecond);
   for (const int r : {1, 100, 10000, 1000000}) b->Arg(r);
 }
 
-BENCHMARK_CAPTURE(viscous, velocity, Unknowns::velocity)->Name("viscous_velocity")->Apply(ratios);
-BENCHMARK_CAPTURE(viscous, all, Unknowns::all)->Name("viscous_coupled")->Apply(ratios);
+BENCHMARK_CAPTURE(viscous, velocity, Unknowns::velocity, 0)->Name("viscous_velocity")->Apply(ratios);
+BENCHMARK_CAPTURE(viscous, all, Unknowns::all, 0)->Name("viscous_coupled")->Apply(ratios);
+BENCHMARK_CAPTURE(viscous, velocity_levels, Unknowns::velocity, LEVELS)->Name("viscous_levels_velocity")->Apply(ratios);
+BENCHMARK_CAPTURE(viscous, all_levels, Unknowns::all, LEVELS)->Name("viscous_levels_coupled")->Apply(ratios);
 
 }  // namespace
 

@@ -436,7 +436,7 @@ Range Hierarchy::unknowns(int g, int i, const Component& c, bool composite) cons
 }
 
 // Ghosts of a node in one direction. A plane of faces on the far side of the box belongs to it unless another node
-// of this grid lies there and owns it.
+// of this grid lies there and owns it; so does the plane between the box and a coarser leaf over it.
 Range Hierarchy::ghost_box(const Grid& grid, const Grid::Node& n, int direction, int normal, int depth) const {
   const IntVec o = direction_offset(direction);
   const int cells = grid.layout.n;
@@ -445,11 +445,11 @@ Range Hierarchy::ghost_box(const Grid& grid, const Grid::Node& n, int direction,
     r.lo[a] = o[a] < 0 ? -depth : o[a] > 0 ? cells : 0;
     r.size[a] = o[a] == 0 ? cells : depth;
     if (a != normal) continue;
-    if (o[a] == 0) {
-      IntVec beyond = o;
-      beyond[a] = 1;
-      if (n.neighbours[at(direction_index(beyond))] < 0) ++r.size[a];
-    } else if (o[a] > 0 && depth == 1) {
+    IntVec above = o;
+    ++above[a];
+    if (o[a] <= 0) {
+      if (n.neighbours[at(direction_index(above))] < 0) ++r.size[a];
+    } else if (depth == 1) {
       r.size[a] = 2;  // the plane at the side, and the first beyond it
     }
   }
@@ -602,7 +602,7 @@ void Hierarchy::with_parents(HierarchyField& f, int g, Route& route, F&& use) {
       });
 }
 
-void Hierarchy::fill_coarse_ghosts(HierarchyField& f, int g, int i, const Parents& parents) const {
+void Hierarchy::fill_coarse_ghosts(HierarchyField& f, int g, int i, const Parents& parents, bool add) const {
   const Grid& gr = grid(g);
   const Grid::Node& n = gr.mine(i);
   for (int d = 0; d < DIRECTIONS; ++d) {
@@ -615,31 +615,37 @@ void Hierarchy::fill_coarse_ghosts(HierarchyField& f, int g, int i, const Parent
         r.lo[b] = o[b] < 0 ? -G : o[b] > 0 ? gr.layout.n : 0;
         r.size[b] = o[b] == 0 ? gr.layout.n : G;
       }
-      if (a >= 0 && d == towards(a, 1)) {  // the plane at the side is the node's own
-        ++r.lo[a];
-        --r.size[a];
-      } else if (a >= 0 && o[a] == 0) {
-        IntVec beyond = o;
-        beyond[a] = 1;
-        if (n.neighbours[at(direction_index(beyond))] < 0) ++r.size[a];
+      if (a >= 0) {
+        IntVec above = o, below = o;
+        ++above[a];
+        --below[a];
+        if (o[a] == 0 && n.neighbours[at(direction_index(above))] == Grid::OUTSIDE) ++r.size[a];
+        if (o[a] >= 0 && n.neighbours[at(direction_index(below))] >= 0) {  // its last plane
+          ++r.lo[a];
+          --r.size[a];
+        }
       }
       const ArrayRef<double> x = f.ref(g, i, c);
-      for_each_cell(r.lo, r.size, [&](const IntVec& q) { *x.at(q) = fine_value(parents[at(c)], q, a, gr.layout.n); });
+      for_each_cell(r.lo, r.size, [&](const IntVec& q) {
+        const double value = fine_value(parents[at(c)], q, a, gr.layout.n);
+        double& ghost = *x.at(q);
+        ghost = add ? ghost + value : value;
+      });
     }
   }
 }
 
-void Hierarchy::fill_from_coarser(HierarchyField& f, int g) {
+void Hierarchy::fill_from_coarser(HierarchyField& coarse, HierarchyField& f, int g) {
   if (g + 1 >= levels_) return;
-  with_parents(f, g, routes_[at(g)].ghosts_from_parent,
-               [&](int i, const Parents& parents) { fill_coarse_ghosts(f, g, i, parents); });
+  with_parents(coarse, g, routes_[at(g)].ghosts_from_parent,
+               [&](int i, const Parents& parents) { fill_coarse_ghosts(f, g, i, parents, false); });
 }
 
 void Hierarchy::prolong_add(HierarchyField& f, int g) {
   with_parents(f, g, routes_[at(g)].from_parent, [&](int i, const Parents& parents) {
     for (int c = 0; c < f.components(); ++c)
       add_linear(f.ref(g, i, c), parents[at(c)], unknowns(g, i, f.component(c), false), f.component(c).normal, grid(g).layout.n);
-    fill_coarse_ghosts(f, g, i, parents);
+    fill_coarse_ghosts(f, g, i, parents, true);
   });
 }
 
@@ -674,7 +680,7 @@ void Hierarchy::prolong_add_shared(HierarchyField& f, const HierarchyField& shar
         out[k + 1] += both(k + 1, 1);
       }
     });
-    fill_coarse_ghosts(f, g, i, parents);
+    fill_coarse_ghosts(f, g, i, parents, true);
   });
 }
 
@@ -941,7 +947,7 @@ void Hierarchy::make_composite(HierarchyField& f, int depth, bool homogeneous, b
   const int last = parents ? levels_ - 1 : coarsest_leaf_;
   for (int g = 0; g < last; ++g) restrict_means(f, f, g);
   for (int g = last; g >= 0; --g) {
-    fill_from_coarser(f, g);
+    fill_from_coarser(f, f, g);
     exchange(f, g, g == 0 ? depth : G, homogeneous);
   }
 }

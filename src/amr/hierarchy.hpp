@@ -64,7 +64,7 @@ struct Grid {
     int local = -1;   ///< position in `local`, -1: another rank's
     int parent = -1;  ///< node of the next coarser grid
     IntVec place{};   ///< where it starts in its parent, cells of the parent
-    std::array<int, DIRECTIONS> neighbours{};  ///< node, COARSER or OUTSIDE
+    std::array<int, DIRECTIONS> neighbours{};  ///< node, COARSER or OUTSIDE; at CENTRE the node itself
   };
 
   Layout layout;
@@ -136,9 +136,11 @@ class Hierarchy {
 
   /// Ghosts of grid g from nodes of the same grid, and beyond the sides; `homogeneous`: side values count as 0.
   void exchange(HierarchyField& f, int g, int depth, bool homogeneous = true);
-  /// Ghosts of grid g where the next coarser grid has leaves, third order. Ghosts of grid g+1 must be filled.
-  void fill_from_coarser(HierarchyField& f, int g);
-  /// Grid g += interpolation of grid g+1, linear, and ghosts as fill_from_coarser. Ghosts of g+1 must be filled.
+  /// Ghosts of f on grid g where the next coarser grid has leaves, third order, from `coarse` (may be f) on grid g+1, ghosts of
+  /// which must be filled.
+  void fill_from_coarser(HierarchyField& coarse, HierarchyField& f, int g);
+  /// Grid g += interpolation of grid g+1: linear, and of the ghosts that fill_from_coarser fills third order. Ghosts of g+1
+  /// must be filled.
   void prolong_add(HierarchyField& f, int g);
   /// The same for one component in cells whose share of the neighbour of its parent along axis a, the nearer one, is
   /// component a of `shares` in place of 1/4.
@@ -208,7 +210,7 @@ class Hierarchy {
   template <class F>
   void with_parents(HierarchyField& f, int g, Route& route, F&& use);
   using Parents = std::array<ArrayRef<const double>, DIM + 1>;
-  void fill_coarse_ghosts(HierarchyField& f, int g, int i, const Parents& parents) const;
+  void fill_coarse_ghosts(HierarchyField& f, int g, int i, const Parents& parents, bool add) const;
   GhostBoxes ghost_boxes(const Grid& grid, const Grid::Node& n, int direction) const;
   template <class PlaneValue>
   void restrict_by(const HierarchyField& from, HierarchyField& to, int g, PlaneValue&& value);

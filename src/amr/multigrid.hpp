@@ -39,7 +39,7 @@ struct MultigridOptions {
 /// Chebyshev steps, two or three of them in one pass over a block from two layers of ghosts, so that memory is read
 /// once where steps and exchanges by themselves read it several times. One component in cells: two steps before and
 /// after the coarser grid, and fluxes of corrections match where levels meet. The components of a vector on faces:
-/// three.
+/// three, and ghosts beside coarser leaves follow the corrections that they are interpolated from.
 class Multigrid {
  public:
   /// Coefficients (of places below 0, and along 0 .. n) need two layers of ghosts on all grids.
@@ -66,7 +66,7 @@ class Multigrid {
   void couple_in_pairs(int g);
   void descend_in_threes(int g);
   void ascend_in_threes(int g);
-  void couple(int g);
+  void meet_coarser(int g);
   void correct_border(int g);
   void close_top(int g, int i, int c, const double* held, double* x) const;
   Range own(int g, int i, int c) const;

@@ -49,7 +49,7 @@ struct FlowOptions {
   Coupling coupling = Coupling::coupled;
   int projections = 1;
   bool rotational = true;
-  double tolerance = 5e-6;
+  double tolerance = 2e-6;
   int max_iterations = 300;
   int coarser_levels = 0;
   double courant = 0.5, max_interval_tau0 = 4, max_change = 0.05;

@@ -3,6 +3,8 @@
 
 #include <gtest/gtest.h>
 
+#include <set>
+
 #include "amr/face_transfer.hpp"
 #include "support/mesh_fixture.hpp"
 
@@ -152,6 +154,61 @@ TEST_P(MpiHierarchy, LinearFieldsContinueAcrossLevels) {
           tally.near(f.at(g, i, c)[h.grid(g).layout.offset(q)], want, 1e-12 * std::abs(want),
                      [&] { return "component " + std::to_string(c) + " of " + text(n.index) + " at " + text(q); });
         });
+    }
+    EXPECT_TRUE(tally.result()) << "trial " << trial;
+    EXPECT_GT(over_ranks(tally.checks(), MPI_COMM_WORLD), 0) << "nothing was compared";
+  }
+}
+
+// Rough values: what a ghost holds must be what the node holds that its place belongs to, corners of refined regions and
+// planes of faces between finer and coarser leaves included.
+TEST_P(MpiHierarchy, GhostsAreTheValuesOfTheirPlaces) {
+  Random random(12);
+  const amr::MeshShape shape = shape_of(vec(2, 2, 1), axes(false, false, false), 3);
+  amr::Mesh mesh(shape, {}, MPI_COMM_WORLD);
+  for (int trial = 0; trial < 4; ++trial) {
+    amr::Tree tree = random_tree(random, shape.root_blocks, shape.periodic(), 3, DIM == 2 ? 60 : 200);
+    put(mesh, tree, deal_out(GetParam(), tree, mesh.ranks(), random));
+    amr::Hierarchy h(mesh);
+    amr::HierarchyField f(h, stokes_like());
+    const int n = mesh.layout().n;
+    const auto at_place = [&](int g, int c, const IntVec& q) { return noise(g, c, q[0], q[1], DIM == 3 ? q[DIM - 1] : 0); };
+    const auto global = [&](int g, int i, IntVec q) {
+      for (int a = 0; a < DIM; ++a) q[a] += n * h.grid(g).mine(i).index.coord[a];
+      return q;
+    };
+    for (int g = 0; g < h.levels(); ++g)
+      for (int i = 0; i < h.grid(g).size(); ++i)
+        for (int c = 0; c <= DIM; ++c) {
+          for_all(mesh.layout(), [&](const IntVec& q) { f.at(g, i, c)[mesh.layout().offset(q)] = 1e30; });
+          const amr::Range r = h.unknowns(g, i, f.component(c), false);
+          amr::for_each_cell(r.lo, r.size, [&](const IntVec& q) { f.at(g, i, c)[mesh.layout().offset(q)] = at_place(g, c, global(g, i, q)); });
+        }
+    Tally tally;
+    for (int g = h.levels() - 1; g >= 0; --g) {
+      h.fill_from_coarser(f, f, g);
+      h.exchange(f, g, amr::Layout::GHOSTS);
+      std::set<IntVec> nodes;
+      for (const Grid::Node& m : h.grid(g).nodes) nodes.insert(m.index.coord);
+      for (int i = 0; i < h.grid(g).size(); ++i)
+        for (int c = 0; c <= DIM; ++c)
+          for_all(mesh.layout(), [&](const IntVec& q) {
+            const int normal = f.component(c).normal;
+            IntVec node = global(g, i, q);
+            for (int a = 0; a < DIM; ++a) {
+              if (node[a] < 0 || node[a] > h.grid(g).extent[a] * n || (a != normal && node[a] == h.grid(g).extent[a] * n)) return;
+              node[a] /= n;
+            }
+            bool known = nodes.contains(node);
+            if (!known && normal >= 0 && global(g, i, q)[normal] % n == 0) {  // the last plane of the node below
+              --node[normal];
+              known = nodes.contains(node);
+            }
+            if (!known) return;
+            tally.near(f.at(g, i, c)[mesh.layout().offset(q)], at_place(g, c, global(g, i, q)), 0, [&] {
+              return "component " + std::to_string(c) + " of " + text(h.grid(g).mine(i).index) + " at " + text(q);
+            });
+          });
     }
     EXPECT_TRUE(tally.result()) << "trial " << trial;
     EXPECT_GT(over_ranks(tally.checks(), MPI_COMM_WORLD), 0) << "nothing was compared";
