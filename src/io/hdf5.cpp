@@ -1,6 +1,7 @@
 #include "io/hdf5.hpp"
 
 #include <fcntl.h>
+#include <semaphore.h>
 #include <unistd.h>
 #ifdef __linux__
 #include <sys/resource.h>
@@ -342,6 +343,18 @@ Handle shared_access_properties(const std::string& path, MPI_Comm comm) {
   return properties;
 }
 
+// Open MPI's I/O guards what it knows of a file by a semaphore of the machine that bears the file's name alone. A process that
+// is killed while it holds it leaves it locked, and whoever opens a file of that name next, in whatever folder, waits for
+// ever. Those who hold it now keep theirs when the name goes.
+void forget_semaphore([[maybe_unused]] const std::string& path, [[maybe_unused]] MPI_Comm comm) {
+#ifdef OPEN_MPI
+  int rank = 0;
+  MPI_Comm_rank(comm, &rank);
+  if (rank == 0) sem_unlink(("/OMPIO_" + std::filesystem::path(path).filename().string()).c_str());
+  MPI_Barrier(comm);
+#endif
+}
+
 hid_t open_file(const std::string& path, Access access, const Handle& properties) {
   const unsigned flags = access == Access::read ? H5F_ACC_RDONLY : H5F_ACC_RDWR;
   return check(H5Fopen(path.c_str(), flags, properties.id()), path, "open the file");
@@ -362,6 +375,7 @@ File File::open(const std::string& path, Access access) {
 }
 
 File File::open(const std::string& path, Access access, MPI_Comm comm) {
+  forget_semaphore(path, comm);
   return {open_file(path, access, shared_access_properties(path, comm)), H5Fclose, path};
 }
 
