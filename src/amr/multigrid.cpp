@@ -530,9 +530,9 @@ void Multigrid::correct_border(int g) {
   });
 }
 
-// What grid g has found as leaves of grid g+1 see it: as means, in step_, where the leaves hold zero. Half of what lies beside
-// them follows from it, so that the ghosts of grid g are not zero: with ghosts that are, a cycle leaves half of the error on
-// planes of faces that coarser leaves share (a seventh everywhere else).
+// What grid g has found as leaves of grid g+1 see it: as means, in step_, where the leaves hold zero. Ghosts of grid g beside
+// those leaves are interpolated from both. With ghosts of zero a cycle leaves half of the error on planes of faces that coarser
+// leaves share, and a seventh everywhere else.
 void Multigrid::meet_coarser(int g) {
   step_.clear(g + 1);
   h_.restrict_means(x_, step_, g);
@@ -598,12 +598,11 @@ void Multigrid::ascend_in_pairs(int g) {
   });
 }
 
-// As couple, but what leaves a coarse leaf is what enters the finer nodes.
-void Multigrid::couple_in_pairs(int g) {
+// step_ for leaves of grid g+1 such that what leaves them is what enters the finer nodes.
+void Multigrid::match_border(int g) {
   Array<int> kappa{};
   for (int a = 0; a < DIM; ++a) kappa[a] = links_[0].along[a].field;
   h_.match_fluxes(x_, step_, g, coefficients_, kappa);
-  correct_border(g + 1);
 }
 
 void Multigrid::cycle() {
@@ -611,11 +610,12 @@ void Multigrid::cycle() {
   for (int g = 0; g < last; ++g) {
     if (scalar_) {
       descend_in_pairs(g);
-      if (h_.leaves_from(g + 1)) couple_in_pairs(g);
     } else {
       descend_in_threes(g);
-      if (h_.leaves_from(g + 1)) correct_border(g + 1);
     }
+    if (!h_.leaves_from(g + 1)) continue;
+    if (scalar_) match_border(g);
+    correct_border(g + 1);
   }
   solve_bottom();
   for (int g = last - 1; g >= 0; --g) {

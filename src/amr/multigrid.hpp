@@ -63,7 +63,7 @@ class Multigrid {
   std::array<Step, MOST_STEPS> chebyshev() const;
   void descend_in_pairs(int g);
   void ascend_in_pairs(int g);
-  void couple_in_pairs(int g);
+  void match_border(int g);
   void descend_in_threes(int g);
   void ascend_in_threes(int g);
   void meet_coarser(int g);
