@@ -360,14 +360,16 @@ void Hierarchy::build_routes(int g) {
       emit(Item{p.local, static_cast<int>(i), 0, static_cast<int>(i), {}}, p.owner, n.owner);
     }
   });
-  // The high faces of a node that has a coarser leaf beyond are the low faces of that leaf.
+  // The high faces of a node that has a coarser leaf beyond are the low faces of that leaf; at a side of the box they are
+  // the high faces of its parent.
   r.to_plane = make_route([&](auto&& emit) {
     for (std::size_t i = 0; i < grid.nodes.size(); ++i)
       for (int a = 0; a < DIM; ++a) {
         const Grid::Node& n = grid.nodes[i];
-        if (n.neighbours[at(towards(a, 1))] != Grid::COARSER) continue;
-        const int beyond = coarse.nodes[at(n.parent)].neighbours[at(towards(a, 1))];
-        const Grid::Node& q = coarse.nodes[at(beyond)];
+        const int above = n.neighbours[at(towards(a, 1))];
+        if (above >= 0) continue;
+        const int owner = above == Grid::OUTSIDE ? n.parent : coarse.nodes[at(n.parent)].neighbours[at(towards(a, 1))];
+        const Grid::Node& q = coarse.nodes[at(owner)];
         emit(Item{q.local, static_cast<int>(i), a, static_cast<int>(i) * DIM + a, {}}, q.owner, n.owner);
       }
   });
@@ -572,12 +574,12 @@ void Hierarchy::apply_sides(HierarchyField& f, int g, int i, int depth, bool hom
 
 // use(local node, parents): parents[c] is the array of the parent, shifted so that its cell 0 holds the node's.
 template <class F>
-void Hierarchy::with_parents(HierarchyField& f, int g, Route& route, F&& use) {
+void Hierarchy::with_parents(const HierarchyField& f, int g, Route& route, F&& use) {
   const Grid& gr = grid(g);
   const int nc = f.components();
   const IntVec size = filled(gr.layout.n / 2 + 2 * G);
   const auto patch = [&](int src, const Grid::Node& n, int c) {
-    ArrayRef<const double> r = std::as_const(f).ref(g + 1, src, c);
+    ArrayRef<const double> r = f.ref(g + 1, src, c);
     r.p = r.at(n.place);
     return r;
   };
@@ -635,7 +637,7 @@ void Hierarchy::fill_coarse_ghosts(HierarchyField& f, int g, int i, const Parent
   }
 }
 
-void Hierarchy::fill_from_coarser(HierarchyField& coarse, HierarchyField& f, int g) {
+void Hierarchy::fill_from_coarser(const HierarchyField& coarse, HierarchyField& f, int g) {
   if (g + 1 >= levels_) return;
   with_parents(coarse, g, routes_[at(g)].ghosts_from_parent,
                [&](int i, const Parents& parents) { fill_coarse_ghosts(f, g, i, parents, false); });
@@ -718,50 +720,54 @@ void Hierarchy::restrict_by(const HierarchyField& from, HierarchyField& to, int 
         for (int c = 0; c < nc; ++c)
           quadrant(local(item.src), to.ref(g + 1, item.dst, c), gr.nodes[at(item.src)].place, c);
       });
-  const auto plane = [&](int i, int a, const ArrayRef<double>& dst, const IntVec& lo, int c) {
-    const ArrayRef<const double> x = from.ref(g, i, c);
-    IntVec flat = size;
-    flat[a] = 1;
-    for_each_cell({}, flat, [&](const IntVec& q) {
-      IntVec fine{}, coarse{};
-      for (int b = 0; b < DIM; ++b) {
-        fine[b] = b == a ? gr.layout.n : 2 * q[b];
-        coarse[b] = b == a ? 0 : lo[b] + q[b];
-      }
-      *dst.at(coarse) = value(x.at(fine), x.stride, a, false, true);
+  const auto plane = [&](const Item& item, const ArrayRef<double>& dst, int c) {
+    const ArrayRef<const double> x = from.ref(g, local(item.src), c);
+    const int a = item.tag;
+    for_each_cell({}, plane_size(g, item), [&](const IntVec& q) {
+      IntVec fine{};
+      for (int b = 0; b < DIM; ++b) fine[b] = b == a ? gr.layout.n : 2 * q[b];
+      *dst.at(q) = value(x.at(fine), x.stride, a, false, true);
     });
   };
-  const auto flat_size = [&](int a) {
-    IntVec flat = size;
-    flat[a] = 1;
-    return flat;
-  };
-  const auto place = [&](const Item& item) {
-    IntVec lo = gr.nodes[at(item.src)].place;
-    lo[item.tag] = 0;
-    return lo;
-  };
-  const auto component_along = [&](int a) {
+  const auto component_of = [&](const Item& item) {
     for (int c = 0; c < nc; ++c)
-      if (from.component(c).normal == a) return c;
+      if (from.component(c).normal == item.tag && plane_is_free(g, item, to.component(c))) return c;
     return -1;
   };
   run(
       routes_[at(g)].to_plane,
-      [&](const Item& item) { return component_along(item.tag) < 0 ? std::ptrdiff_t{0} : volume(flat_size(item.tag)); },
+      [&](const Item& item) { return component_of(item) < 0 ? std::ptrdiff_t{0} : volume(plane_size(g, item)); },
       [&](const Item& item, double* p) {
-        if (const int c = component_along(item.tag); c >= 0)
-          plane(local(item.src), item.tag, packed_ref(p, flat_size(item.tag)), {}, c);
+        if (const int c = component_of(item); c >= 0) plane(item, packed_ref(p, plane_size(g, item)), c);
       },
       [&](const Item& item, const double* p) {
-        const IntVec flat = flat_size(item.tag);
-        if (const int c = component_along(item.tag); c >= 0)
-          copy_box(to.ref(g + 1, item.dst, c), place(item), packed_ref(p, flat), {}, flat);
+        const IntVec flat = plane_size(g, item);
+        if (const int c = component_of(item); c >= 0) copy_box(plane_target(to, g, item, c), {}, packed_ref(p, flat), {}, flat);
       },
       [&](const Item& item) {
-        if (const int c = component_along(item.tag); c >= 0)
-          plane(local(item.src), item.tag, to.ref(g + 1, item.dst, c), place(item), c);
+        if (const int c = component_of(item); c >= 0) plane(item, plane_target(to, g, item, c), c);
       });
+}
+
+IntVec Hierarchy::plane_size(int g, const Item& item) const {
+  IntVec size = filled(grid(g).layout.n / 2);
+  size[item.tag] = 1;
+  return size;
+}
+
+bool Hierarchy::plane_is_free(int g, const Item& item, const Component& c) const {
+  const Grid::Node& n = grid(g).nodes[at(item.src)];
+  return n.neighbours[at(towards(item.tag, 1))] != Grid::OUTSIDE || !c.sides[at(face_of(item.tag, true))].odd;
+}
+
+ArrayRef<double> Hierarchy::plane_target(HierarchyField& to, int g, const Item& item, int c) const {
+  const Grid::Node& n = grid(g).nodes[at(item.src)];
+  const bool side = n.neighbours[at(towards(item.tag, 1))] == Grid::OUTSIDE;
+  IntVec lo = n.place;
+  lo[item.tag] = side ? lo[item.tag] + grid(g).layout.n / 2 : 0;
+  ArrayRef<double> dst = to.ref(g + 1, item.dst, c);
+  dst.p = dst.at(lo);
+  return dst;
 }
 
 void Hierarchy::restrict_means(const HierarchyField& from, HierarchyField& to, int g) {
@@ -794,33 +800,29 @@ void Hierarchy::restrict_weighted(const std::function<Array<ArrayRef<const doubl
           take_weighted(dst, x[c], c, cells);
         }
       });
-  const auto flat = [&](const Item& item) {
-    IntVec s = size;
-    s[item.tag] = 1;
-    return s;
-  };
   const auto plane = [&](const Item& item, const ArrayRef<double>& dst) {
     const int a = item.tag;
     const ArrayRef<const double> x = made(local(item))[a];
-    for_each_cell({}, flat(item), [&](const IntVec& q) {
+    for_each_cell({}, plane_size(g, item), [&](const IntVec& q) {
       IntVec fine{};
       for (int b = 0; b < DIM; ++b) fine[b] = b == a ? cells : 2 * q[b];
       const double* p = x.at(fine);
       *dst.at(q) = 0.75 * mean_across(p, x.stride, a) + 0.25 * mean_across(p - x.stride[a], x.stride, a);
     });
   };
-  const auto target = [&](const Item& item) {
-    IntVec lo = gr.nodes[at(item.src)].place;
-    lo[item.tag] = 0;
-    ArrayRef<double> dst = to.ref(g + 1, item.dst, item.tag);
-    dst.p = dst.at(lo);
-    return dst;
-  };
+  const auto is_free = [&](const Item& item) { return plane_is_free(g, item, to.component(item.tag)); };
   run(
-      routes_[at(g)].to_plane, [&](const Item& item) { return volume(flat(item)); },
-      [&](const Item& item, double* p) { plane(item, packed_ref(p, flat(item))); },
-      [&](const Item& item, const double* p) { copy_box(target(item), {}, packed_ref(p, flat(item)), {}, flat(item)); },
-      [&](const Item& item) { plane(item, target(item)); });
+      routes_[at(g)].to_plane, [&](const Item& item) { return is_free(item) ? volume(plane_size(g, item)) : 0; },
+      [&](const Item& item, double* p) {
+        if (is_free(item)) plane(item, packed_ref(p, plane_size(g, item)));
+      },
+      [&](const Item& item, const double* p) {
+        const IntVec flat = plane_size(g, item);
+        if (is_free(item)) copy_box(plane_target(to, g, item, item.tag), {}, packed_ref(p, flat), {}, flat);
+      },
+      [&](const Item& item) {
+        if (is_free(item)) plane(item, plane_target(to, g, item, item.tag));
+      });
 }
 
 void Hierarchy::restrict_links(HierarchyField& f, int g) {

@@ -138,7 +138,7 @@ class Hierarchy {
   void exchange(HierarchyField& f, int g, int depth, bool homogeneous = true);
   /// Ghosts of f on grid g where the next coarser grid has leaves, third order, from `coarse` (may be f) on grid g+1, ghosts of
   /// which must be filled.
-  void fill_from_coarser(HierarchyField& coarse, HierarchyField& f, int g);
+  void fill_from_coarser(const HierarchyField& coarse, HierarchyField& f, int g);
   /// Grid g += interpolation of grid g+1: linear, and of the ghosts that fill_from_coarser fills third order. Ghosts of g+1
   /// must be filled.
   void prolong_add(HierarchyField& f, int g);
@@ -208,12 +208,17 @@ class Hierarchy {
   template <class Size, class Pack, class Unpack, class Direct>
   void run(Route& r, Size&& size, Pack&& pack, Unpack&& unpack, Direct&& direct);
   template <class F>
-  void with_parents(HierarchyField& f, int g, Route& route, F&& use);
+  void with_parents(const HierarchyField& f, int g, Route& route, F&& use);
   using Parents = std::array<ArrayRef<const double>, DIM + 1>;
   void fill_coarse_ghosts(HierarchyField& f, int g, int i, const Parents& parents, bool add) const;
   GhostBoxes ghost_boxes(const Grid& grid, const Grid::Node& n, int direction) const;
   template <class PlaneValue>
   void restrict_by(const HierarchyField& from, HierarchyField& to, int g, PlaneValue&& value);
+  // Of an item of Routes::to_plane: how many faces the plane has in the coarser grid, whether component c has unknowns there,
+  // and where it begins.
+  IntVec plane_size(int g, const Item& item) const;
+  bool plane_is_free(int g, const Item& item, const Component& c) const;
+  ArrayRef<double> plane_target(HierarchyField& to, int g, const Item& item, int c) const;
   Range ghost_box(const Grid& grid, const Grid::Node& n, int direction, int normal, int depth) const;
   void apply_sides(HierarchyField& f, int g, int i, int depth, bool homogeneous) const;
 

@@ -238,34 +238,44 @@ void Multigrid::prepare_shares() {
     });
 }
 
-// f(place in the array, number) for the unknowns of the coarsest grid, all of which are rank 0's.
+// Whether face q of a component lies on a side of the box where it is free.
+bool Multigrid::on_free_side(const Grid::Node& n, const Component& c, const IntVec& q, int cells) {
+  if (c.normal < 0 || (q[c.normal] != 0 && q[c.normal] != cells)) return false;
+  const int face = 2 * c.normal + (q[c.normal] != 0 ? 1 : 0);
+  return n.neighbours[at(direction_index(face_offset(face)))] == Grid::OUTSIDE && !c.sides[at(face)].odd;
+}
+
+// f(node, component, face or cell, number) for the unknowns of the coarsest grid, all of which are rank 0's.
 template <class F>
 void Multigrid::for_bottom(F&& f) const {
   const int g = h_.grids() - 1;
   int number = 0;
   for (int i = 0; i < h_.grid(g).size(); ++i)
     for (int c = 0; c < x_.components(); ++c)
-      for_each_cell_of(h_.unknowns(g, i, x_.component(c), false), [&](const IntVec& q) {
-        f(i, c, h_.grid(g).layout.offset(q), number++);
-      });
+      for_each_cell_of(h_.unknowns(g, i, x_.component(c), false), [&](const IntVec& q) { f(i, c, q, number++); });
 }
 
-// Ghosts that have been filled from the numbers of the unknowns tell where the links lead, and with which sign.
+// Ghosts that have been filled from the numbers of the unknowns tell where the links lead, and with which sign. Half a cell
+// belongs to a face on a free side: with its row halved the matrix is symmetric. The shear on such a side, through which the
+// velocity along it would feel the one across it but not the other way round, is left out.
 void Multigrid::prepare_bottom() {
   const int g = h_.grids() - 1;
+  const Layout& layout = h_.grid(g).layout;
   x_.clear(g);
-  int size = 0;
-  for_bottom([&](int i, int c, std::ptrdiff_t q, int number) {
-    x_.at(g, i, c)[q] = number + 1;
-    size = number + 1;
+  bottom_weights_.clear();
+  for_bottom([&](int i, int c, const IntVec& q, int number) {
+    x_.at(g, i, c)[layout.offset(q)] = number + 1;
+    bottom_weights_.push_back(on_free_side(h_.grid(g).mine(i), x_.component(c), q, layout.n) ? 0.5 : 1.0);
   });
+  const int size = static_cast<int>(bottom_weights_.size());
   h_.exchange(x_, g, 1);
   if (size == 0) return;
   std::vector<SparseSolver::Entry> entries;
-  for_bottom([&](int i, int c, std::ptrdiff_t q, int row) {
-    const auto add = [&](const double* number, std::ptrdiff_t place, double value) {
-      const double k = number[place];
-      if (k != 0) entries.push_back({row, static_cast<int>(std::abs(k)) - 1, std::copysign(value, value * k)});
+  for_bottom([&](int i, int c, const IntVec& place, int row) {
+    const std::ptrdiff_t q = layout.offset(place);
+    const auto add = [&](const double* number, std::ptrdiff_t where, double value) {
+      const double k = number[where];
+      if (k != 0) entries.push_back({row, static_cast<int>(std::abs(k)) - 1, bottom_weights_[at(row)] * std::copysign(value, value * k)});
     };
     with_operator(x_, g, i, c, [&](const Operator& o, auto) {
       const double* x = x_.at(g, i, c);
@@ -276,7 +286,9 @@ void Multigrid::prepare_bottom() {
           const double link = o.below(a, q + side * s);
           add(x, q, link);
           add(x, q + (2 * side - 1) * s, -link);
-          if (o.other[a] == nullptr) continue;
+          IntVec edge = place;
+          edge[a] += side;
+          if (o.other[a] == nullptr || on_free_side(h_.grid(g).mine(i), x_.component(a), edge, layout.n)) continue;
           const double sign = side == 0 ? link : -link;
           add(o.other[a], q + side * s, sign);
           add(o.other[a], q + side * s - o.stride[c], -sign);
@@ -302,7 +314,8 @@ void Multigrid::solve_bottom() {
   x_.clear(g);
   bottom_values_.resize(at(bottom_size_));
   if (bottom_size_ == 0) return;
-  for_bottom([&](int i, int c, std::ptrdiff_t q, int k) { bottom_values_[at(k)] = rhs_.at(g, i, c)[q]; });
+  const Layout& layout = h_.grid(g).layout;
+  for_bottom([&](int i, int c, const IntVec& q, int k) { bottom_values_[at(k)] = bottom_weights_[at(k)] * rhs_.at(g, i, c)[layout.offset(q)]; });
   if (hypre_bottom_ != nullptr) {
     const std::vector<double> b = bottom_values_;
     std::fill(bottom_values_.begin(), bottom_values_.end(), 0.0);
@@ -310,7 +323,7 @@ void Multigrid::solve_bottom() {
   } else {
     bottom_.solve(bottom_values_);
   }
-  for_bottom([&](int i, int c, std::ptrdiff_t q, int k) { x_.at(g, i, c)[q] = bottom_values_[at(k)]; });
+  for_bottom([&](int i, int c, const IntVec& q, int k) { x_.at(g, i, c)[layout.offset(q)] = bottom_values_[at(k)]; });
 }
 
 // Chebyshev iteration with the diagonal as preconditioner, on eigenvalues from 2/lowest to 2: a few multiply-adds a
@@ -329,25 +342,29 @@ std::array<Multigrid::Step, Multigrid::MOST_STEPS> Multigrid::chebyshev() const 
   return steps;
 }
 
-// Component c of x on the plane of faces beyond the last one of a node that no node of its level follows: what a step
-// with one layer of ghosts does not reach. `held`: what lies there, a coarser leaf's.
-void Multigrid::close_top(int g, int i, int c, const double* held, double* x) const {
+// The first layer beyond free sides of the box as mirror images of x, which sweeps over that layer do not give: two velocities
+// mirrored alike have no mirrored shear. And what lies on the plane beyond the last one, where no sweep gets, as `held`.
+void Multigrid::close_sides(int g, int i, int c, const double* held, double* x) const {
   const Component& component = x_.component(c);
-  const int a = component.normal;
   const Grid::Node& n = h_.grid(g).mine(i);
-  IntVec o{};
-  o[a] = 1;
-  const int above = n.neighbours[at(direction_index(o))];
-  if (above >= 0) return;
   const Layout& layout = h_.grid(g).layout;
-  Range plane = grown(layout.n, 1);
-  plane.lo[a] = layout.n + 1;
-  plane.size[a] = 1;
-  const bool mirrored = above == Grid::OUTSIDE && !component.sides[at(2 * a + 1)].odd;
-  for_each_cell_of(plane, [&](const IntVec& q) {
-    const std::ptrdiff_t p = layout.offset(q);
-    x[p] = mirrored ? x[p - 2 * layout.stride(a)] : held[p];
-  });
+  const int cells = layout.n;
+  for (int f = 0; f < FACES; ++f) {
+    const int a = face_axis(f), beyond = n.neighbours[at(direction_index(face_offset(f)))];
+    const bool normal = a == component.normal, high = face_is_high(f);
+    const bool free = beyond == Grid::OUTSIDE && !component.sides[at(f)].odd;
+    if (beyond >= 0 || (!free && !(normal && high))) continue;
+    const int to = !high ? -1 : normal ? cells + 1 : cells, from = high ? cells - 1 : normal ? 1 : 0;
+    const std::ptrdiff_t back = (from - to) * layout.stride(a);
+    Range plane = grown(cells, 1);
+    ++plane.size[component.normal];
+    plane.lo[a] = to;
+    plane.size[a] = 1;
+    for_each_cell_of(plane, [&](const IntVec& q) {
+      const std::ptrdiff_t p = layout.offset(q);
+      x[p] = free ? x[p + back] : held[p];
+    });
+  }
 }
 
 // The unknowns of a component and the faces of walls: whole rows.
@@ -414,10 +431,8 @@ void Multigrid::descend_in_threes(int g) {
                 two.at(c), begin, end, second.weight, second.momentum);
           });
         });
-        close_top(g, i, c, one.at(c), two.at(c));
+        close_sides(g, i, c, one.at(c), two.at(c));
       });
-    // Nothing from the cycle before where coarser leaves lie.
-    if (beside_coarser(h_.grid(g).mine(i))) std::fill_n(x_.at(g, i, 0) - one.origin, components * one.size, 0.0);
     for (int c = 0; c < components; ++c)
       with_operator(x_, g, i, c, [&](const Operator& whole, auto kind) {
         of_scratch(whole, two, [&](const Operator& o) {
@@ -477,7 +492,7 @@ void Multigrid::ascend_in_threes(int g) {
           first_step<decltype(kind)::value>(o, x_.at(g, i, c), rhs_.at(g, i, c), inverse_.at(g, i, c), one.at(c),
               begin, end, first.weight);
         });
-        close_top(g, i, c, x_.at(g, i, c), one.at(c));
+        close_sides(g, i, c, x_.at(g, i, c), one.at(c));
       });
     for (int c = 0; c < components; ++c)
       with_operator(x_, g, i, c, [&](const Operator& whole, auto kind) {

@@ -68,12 +68,13 @@ class Multigrid {
   void ascend_in_threes(int g);
   void meet_coarser(int g);
   void correct_border(int g);
-  void close_top(int g, int i, int c, const double* held, double* x) const;
+  void close_sides(int g, int i, int c, const double* held, double* x) const;
   Range own(int g, int i, int c) const;
   Array<ArrayRef<const double>> residual_round(int g, int i) const;
   void prepare_shares();
   void prepare_bottom();
   void solve_bottom();
+  static bool on_free_side(const Grid::Node& n, const Component& c, const IntVec& q, int cells);
   template <class F>
   void for_bottom(F&& f) const;
   /// f(places of a row of unknowns, its length) for one component of one node.
@@ -94,7 +95,7 @@ class Multigrid {
   SparseSolver bottom_;
   std::unique_ptr<HypreSolver> hypre_bottom_;
   int bottom_size_ = 0;
-  std::vector<double> bottom_values_;
+  std::vector<double> bottom_values_, bottom_weights_;
 };
 
 }  // namespace dendrift::amr

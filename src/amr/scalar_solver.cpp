@@ -148,19 +148,6 @@ void ScalarSolver::spread_beta() {
   for (int g = 0; g + 1 < hierarchy_.grids(); ++g) {
     hierarchy_.exchange(beta_, g, 1);
     hierarchy_.restrict_links(beta_, g);
-    const Grid& coarse = hierarchy_.grid(g + 1);
-    parallel_for(coarse.size(), [&](int i) {
-      const Grid::Node& n = coarse.mine(i);
-      for (int a = 0; a < DIM; ++a) {
-        // A plane on the high side of the box is no child's low plane: it takes what is next to it.
-        if (n.leaf >= 0 || n.neighbours[at(direction_index(face_offset(2 * a + 1)))] != Grid::OUTSIDE) continue;
-        const ArrayRef<double> beta = beta_.ref(g + 1, i, a);
-        IntVec lo{}, size = filled(coarse.layout.n);
-        lo[a] = coarse.layout.n;
-        size[a] = 1;
-        for_each_cell(lo, size, [&](const IntVec& q) { *beta.at(q) = beta.at(q)[-beta.stride[a]]; });
-      }
-    });
   }
   for (int g = 0; g < hierarchy_.grids(); ++g) hierarchy_.exchange(beta_, g, Layout::GHOSTS);
 }

@@ -543,7 +543,7 @@ void StokesSolver::finish(const Vector& x, StokesResult& result) {
       for (int a = 0; a < DIM; ++a) {
         const double* v = velocity[a] + layout.offset(q);
         sum += v[layout.stride(a)] - v[0];
-        fastest = std::max(fastest, std::abs(v[0]));
+        fastest = std::max({fastest, std::abs(v[0]), std::abs(v[layout.stride(a)])});
       }
       div = std::max(div, std::abs(sum));
     });

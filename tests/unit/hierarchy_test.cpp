@@ -215,6 +215,71 @@ TEST_P(MpiHierarchy, GhostsAreTheValuesOfTheirPlaces) {
   }
 }
 
+// A box, its sides and its values turned end for end along all axes: so is all that leaves see round them, whichever sides
+// are free. Planes of faces on high sides are nobody's low planes and want care of their own.
+TEST_P(MpiHierarchy, MirrorImagesAgree) {
+  Random random(13);
+  const amr::MeshShape shape = shape_of(vec(2, 1, 1), axes(false, false, false), 3);
+  const int n = shape.block_cells;
+  amr::Mesh mesh(shape, {}, MPI_COMM_WORLD), turned_mesh(shape, {}, MPI_COMM_SELF);
+  for (int trial = 0; trial < 4; ++trial) {
+    const amr::Tree tree = random_tree(random, shape.root_blocks, shape.periodic(), 3, DIM == 2 ? 60 : 200);
+    std::vector<amr::BlockIndex> leaves(tree.leaves().begin(), tree.leaves().end());
+    for (amr::BlockIndex& b : leaves)
+      for (int a = 0; a < DIM; ++a) b.coord[a] = (shape.root_blocks[a] << b.level) - 1 - b.coord[a];
+    put(mesh, tree, deal_out(GetParam(), tree, mesh.ranks(), random));
+    put(turned_mesh, amr::Tree(shape.root_blocks, shape.periodic(), 3, leaves), std::vector<int>(leaves.size(), 0));
+    std::vector<Component> components = stokes_like(), turned = components;
+    for (std::size_t c = 0; c < components.size(); ++c)
+      for (std::size_t f = 0; f < FACES; ++f) turned[c].sides[f ^ 1].odd = components[c].sides[f].odd = random.chance(0.5);
+    const auto filled_in = [&](amr::Hierarchy& h, const std::vector<Component>& list, bool is_turned) {
+      amr::HierarchyField f(h, list);
+      for (int g = 0; g < h.levels(); ++g)
+        for (int i = 0; i < h.grid(g).size(); ++i)
+          for (int c = 0; c <= DIM; ++c) {
+            for_all(mesh.layout(), [&](const IntVec& q) { f.at(g, i, c)[mesh.layout().offset(q)] = 1e30; });
+            if (h.grid(g).mine(i).leaf < 0) continue;
+            const amr::Range r = h.unknowns(g, i, f.component(c), true);
+            amr::for_each_cell(r.lo, r.size, [&](const IntVec& q) {
+              IntVec place{};
+              for (int a = 0; a < DIM; ++a) {
+                place[a] = q[a] + n * h.grid(g).mine(i).index.coord[a];
+                if (is_turned) place[a] = h.grid(g).extent[a] * n - place[a] - (a == f.component(c).normal ? 0 : 1);
+              }
+              f.at(g, i, c)[mesh.layout().offset(q)] = noise(g, c, place[0], place[1], DIM == 3 ? place[DIM - 1] : 0);
+            });
+          }
+      h.make_composite(f, 1, true);
+      return f;
+    };
+    amr::Hierarchy h(mesh), other(turned_mesh);
+    const amr::HierarchyField f = filled_in(h, components, false), image = filled_in(other, turned, true);
+    Tally tally;
+    for (int b = 0; b < mesh.size(); ++b) {
+      const auto [g, i] = h.place_of_block(b);
+      amr::BlockIndex opposite = h.grid(g).mine(i).index;
+      for (int a = 0; a < DIM; ++a) opposite.coord[a] = h.grid(g).extent[a] - 1 - opposite.coord[a];
+      const amr::Hierarchy::Place there = other.place_of_block(turned_mesh.tree().find(opposite));
+      for (int c = 0; c <= DIM; ++c) {
+        const int normal = f.component(c).normal;
+        IntVec size = filled(n + 2);
+        if (normal >= 0) ++size[normal];
+        amr::for_each_cell(filled(-1), size, [&, g = g, i = i](const IntVec& q) {
+          IntVec p{};
+          for (int a = 0; a < DIM; ++a) p[a] = n - q[a] - (a == normal ? 0 : 1);
+          const double got = f.at(g, i, c)[mesh.layout().offset(q)];
+          tally.near(got, image.at(there.grid, there.node, c)[mesh.layout().offset(p)], 1e-13, [&] {
+            return "component " + std::to_string(c) + " of " + text(h.grid(g).mine(i).index) + " at " + text(q);
+          });
+          tally.expect(std::abs(got) < 100, [&] { return "nothing was written to " + text(q) + " of component " + std::to_string(c); });
+        });
+      }
+    }
+    EXPECT_TRUE(tally.result()) << "trial " << trial;
+    EXPECT_GT(over_ranks(tally.checks(), MPI_COMM_WORLD), 0) << "nothing was compared";
+  }
+}
+
 INSTANTIATE_TEST_SUITE_P(Deals, MpiHierarchy, ::testing::ValuesIn(kDeals));
 
 }  // namespace
