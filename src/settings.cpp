@@ -214,6 +214,8 @@ Settings::Settings() {
     }
     const std::vector<physics::Seed> seeds = physics::make_seeds(all, s);
     const auto held = std::ranges::count_if(seeds, &physics::Seed::held);
+    if (held > 0 && flow.prescribed())
+      checks.fail("flow", "a velocity that is solved for, where crystals are held", "a prescribed one");
     if (checks.has_table("flow") && held > 0 && held < std::ssize(seeds) && flow.solid == physics::SolidModel::viscous &&
         flow.motion == physics::Motion::free)
       checks.fail("flow.solid", "\"penalised\", where some crystals are held and others free", "\"viscous\"");

@@ -69,6 +69,8 @@ void FlowOptions::declare(io::Schema& schema) {
   t.integer("projections", projections).range(1, 100).doc("passes of each step with coupling = \"projection\"");
   t.boolean("rotational", rotational).doc("the projection's pressure takes -nu div v as well");
   t.real("tolerance", tolerance).range(1e-12, 0.1).doc("preconditioned residual of a solution over the norm of the velocity; crystals err by some 10 times as much");
+  t.choice("bottom", bottom, {{"direct", amr::BottomSolver::direct}, {"hypre", amr::BottomSolver::hypre}})
+      .doc("solver of the last grid of multigrid: a sparse factorization, or hypre's conjugate gradients with algebraic multigrid");
   t.integer("max_iterations", max_iterations).at_least(1).doc("of a solution; more is a numerical failure");
   t.integer("coarser_levels", coarser_levels)
       .range(0, 1)
@@ -94,6 +96,24 @@ void FlowOptions::declare(io::Schema& schema) {
     if (!checks.has_table("flow")) return;
     if (velocity_um_s && velocity_w0_tau0)
       checks.fail("flow", "at most one of velocity_um_s and velocity_W0_tau0", "both");
+    // What would be ignored without a word.
+    const auto idle = [&](const std::string& key, bool asked, const char* where) {
+      if (asked) checks.fail("flow." + key, where);
+    };
+    const char* solved = "no such key beside a prescribed velocity, with which nothing is solved";
+    idle("motion", prescribed() && motion == Motion::held, solved);
+    idle("coarser_levels", prescribed() && coarser_levels != 0, solved);
+    idle("wall_gradient_per_tau0", prescribed() && wall_gradient_per_tau0.has_value(), solved);
+    idle("initial_velocity_W0_tau0", prescribed() && initial_velocity_w0_tau0 != RealVec{}, solved);
+    idle("initial_vortex_W0_tau0", prescribed() && initial_vortex_w0_tau0 != 0, solved);
+    for (std::size_t f = 0; f < FACES; ++f) {
+      idle(std::string(SIDES[f]) + "_velocity_W0_tau0", prescribed() && wall_velocity_w0_tau0[f].has_value(), solved);
+      idle(std::string(SIDES[f]) + "_profile", wall_profile[f] == Profile::parabolic && !wall_velocity_w0_tau0[f],
+           "a velocity of this wall, whose profile it is");
+    }
+    idle("projections", coupling == Coupling::coupled && projections > 1, "1, or coupling = \"projection\"");
+    if (bottom == amr::BottomSolver::hypre && !amr::HypreSolver::available())
+      checks.fail("flow.bottom", "\"direct\": this build has no hypre");
     if (!velocity_gradient_per_tau0) return;
     double trace = 0, largest = 0;
     for (int a = 0; a < DIM; ++a) {
@@ -404,6 +424,7 @@ void Flow::make_solver() {
   o.coupling = options_.coupling;
   o.passes = options_.projections;
   o.rotational = options_.rotational;
+  o.bottom = options_.bottom;
   solver_ = std::make_unique<StokesSolver>(*mesh_, o);
   for (int f = 0; f < FACES; ++f)
     for (int a = 0; a < DIM && mesh_->shape().sides[at(f)] == amr::Side::wall; ++a)

@@ -50,6 +50,7 @@ struct FlowOptions {
   int projections = 1;
   bool rotational = true;
   double tolerance = 2e-6;
+  amr::BottomSolver bottom = amr::BottomSolver::direct;
   int max_iterations = 300;
   int coarser_levels = 0;
   double courant = 0.5, max_interval_tau0 = 4, max_change = 0.05;

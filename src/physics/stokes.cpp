@@ -56,8 +56,9 @@ StokesSolver::StokesSolver(const amr::Mesh& mesh, const StokesOptions& options)
       pressure_(hierarchy_, {components_[DIM]}) {
   for (const amr::Side s : mesh.shape().sides) closed_ = closed_ && s != amr::Side::open;
   velocity_cycle_ = std::make_unique<amr::Multigrid>(hierarchy_, velocities(components_), viscosity_,
-                                                     amr::MultigridOptions{.lowest = 12});
-  pressure_cycle_ = std::make_unique<amr::Multigrid>(hierarchy_, std::vector<Component>{components_[DIM]}, viscosity_);
+                                                     amr::MultigridOptions{.lowest = 12, .bottom = options.bottom});
+  pressure_cycle_ = std::make_unique<amr::Multigrid>(hierarchy_, std::vector<Component>{components_[DIM]}, viscosity_,
+                                                     amr::MultigridOptions{.bottom = options.bottom});
   pressure_cycle_->prepare({amr::Links{}});
   gmres_.residual = [this](const Vector& x, Vector& r) {
     unpack(x, state_);
@@ -202,7 +203,8 @@ void StokesSolver::set_drag(const std::function<void(int, double*)>& phase, cons
   if (drag_ == nullptr) {
     drag_ = std::make_unique<HierarchyField>(hierarchy_, faces);
     mobility_ = std::make_unique<HierarchyField>(hierarchy_, faces);
-    pressure_cycle_ = std::make_unique<amr::Multigrid>(hierarchy_, std::vector<Component>{components_[DIM]}, *mobility_);
+    pressure_cycle_ = std::make_unique<amr::Multigrid>(hierarchy_, std::vector<Component>{components_[DIM]}, *mobility_,
+                                                       amr::MultigridOptions{.bottom = options_.bottom});
   }
   for_leaves([&](int b, int g, int i, double) {
     with_phase(b, phase, [&](const double* phi) {

@@ -30,6 +30,7 @@ struct StokesOptions {
   bool rotational = true;  ///< its pressure takes -nu div v as well (Timmermans, Minev & van de Vosse, 1996)
   double tolerance = 1e-6;  ///< preconditioned residual over the norm of the velocity
   int max_iterations = 300;
+  amr::BottomSolver bottom = amr::BottomSolver::direct;  ///< of all cycles
 };
 
 struct StokesResult {

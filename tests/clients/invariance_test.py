@@ -116,7 +116,7 @@ radius_W0 = 6
 [flow]
 velocity_W0_tau0 = [4, 2]
 """),
-    "2D flow": (dict(lines=0.5, steps=81, omega=0.4), SINKING),
+    "2D flow": (dict(lines=0.5, steps=105, omega=0.4), SINKING),
     "2D flow on a coarser mesh": (dict(lines=0.5, steps=81, omega=0.4), SINKING + "coarser_levels = 1"),
     "2D flow, penalised": (dict(lines=0.5, steps=81, omega=0.4), SINKING + 'solid = "penalised"\ntolerance = 1e-7'),
     "2D flow, held": (dict(lines=0.5, steps=81, omega=0.4), SINKING + 'motion = "held"\ncoupling = "projection"'),
@@ -184,6 +184,16 @@ radius_W0 = 4
 nucleation_time_tau0 = 1
 [flow]
 velocity_W0_tau0 = [3, 1, -2]
+"""),
+    # a crystal that sinks and turns between walls: the flow is solved
+    "3D flow": (dict(lines=0.1, steps=57, omega=0.3), MESH_3D + """
+[[seed]]
+position_W0 = [26, 32, 40]
+radius_W0 = 8
+euler_deg = [10, 30, 50]
+[flow]
+max_interval_tau0 = 0.2
+gravity_um_s2 = 3e10
 """),
     "3D drift": (dict(lines=0.2, steps=33, omega=0.2), MESH_3D + PERIODIC_3D + """
 [[seed]]
