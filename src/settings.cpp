@@ -229,6 +229,8 @@ Settings::Settings() {
       };
       if (!std::isfinite(seeds[i].radius) || seeds[i].radius <= 0)
         fail(all[i].radius_w0 ? "radius_W0" : "radius_um", fmt::format("a radius that is a positive number of W0 = {:.3g} um", s.w0_um));
+      if (!(seeds[i].inner_radius < seeds[i].radius))
+        fail(all[i].inner_radius_w0 ? "inner_radius_W0" : "inner_radius_um", fmt::format("less than the radius, {:.4g} W0", seeds[i].radius));
       for (int a = 0; a < DIM; ++a)
         if (!(seeds[i].position[a] >= 0 && seeds[i].position[a] <= size[a]))
           fail(all[i].position_w0 ? "position_W0" : "position_um", "a point inside the box");

@@ -75,6 +75,7 @@ Simulation::Simulation(Settings& settings, MPI_Comm comm, const std::optional<st
     build_initial_mesh();
     initial_solute_ = totals().solute_mean;
   }
+  first_time_ = time_;
 }
 
 Simulation::~Simulation() = default;
@@ -763,7 +764,7 @@ void Simulation::progress(const Totals& t, double dt, bool last) {
   last_progress_ = now;
   const double wall = now - wall_start_;
   const double done = settings_.end_time > 0 ? time_ / settings_.end_time : 1;
-  const double left = done > 0 ? wall / done - wall : 0;
+  const double left = time_ > first_time_ ? wall * (settings_.end_time - time_) / (time_ - first_time_) : 0;
   fmt::print("step {:7d}  t {:9.4g} s  {:5.1f} %  dt {:6.3f} tau0  cells {:8d}  solid {:7.4f}  wall {:6.1f} s  left {:6.1f} s\n",
              step_, time_ * settings_.scales.tau0_s, 100 * done, dt, t.blocks * volume(filled(mesh_->layout().n)),
              t.solid_fraction, wall, last ? 0 : left);

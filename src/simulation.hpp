@@ -144,7 +144,7 @@ class Simulation {
   std::unique_ptr<amr::GhostExchange> ghosts_;
   std::vector<physics::Seed> crystals_;
   amr::CellField psi_, c_;
-  double time_ = 0;  // tau0
+  double time_ = 0, first_time_ = 0;  // tau0; first: of this run, a restart's is later
   std::int64_t step_ = 0, first_step_ = 0;  // that of the checkpoint after a restart
   std::int64_t next_regrid_ = 0;
   std::int64_t plots_ = 0, lines_ = 0, checkpoints_ = 0;  // written so far: the next is due at that multiple

@@ -1,10 +1,13 @@
 #!/usr/bin/python3
-"""Curves of figures 1 to 5 of Qi et al. (2017) from runs of inputs/paper/fig1_mobile.toml and fig1_stationary.toml.
+"""Curves of figures 1 to 5 of Qi et al. (2017) from runs of inputs/paper/fig1_*.toml and fig5_no_solutal.toml.
 
-    figure1.py --mobile out/fig1_mobile --stationary out/fig1_stationary [--every 0.01] [--out docs/figures/fig1_curves.png]
+    figure1.py --mobile out/fig1_mobile --stationary out/fig1_stationary [--diffusion out/fig1_diffusion]
+               [--no-solutal out/fig5_no_solutal] [--every 0.01] [--out docs/figures/fig1_curves.png]
 
 Length of the arms, speeds of the tips and of the crystal, largest speed of the melt against time, as a PNG, and the same
-numbers as docs/results/fig1_{mobile,stationary}.csv. Runs that are still going, or were stopped, are drawn as far as they are.
+numbers as docs/results/fig1_{mobile,stationary,diffusion}.csv and fig5_no_solutal.csv; composition and flow at the times that the paper shows, with its isolines
+(c every .1 wt% from 4.05; speed every 100 um/s, or 10 in the stationary case), as docs/figures/fig1_{mobile,stationary}.png.
+Runs that are still going, or were stopped, are drawn as far as they are.
 """
 import argparse
 import csv
@@ -14,8 +17,12 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
+
+from plotfile import Plotfile, find_plotfiles  # noqa: E402
 
 ROOT = Path(__file__).resolve().parent.parent
+SHOWN = {"mobile": ((0.32, 0.85, 1.22), 100.0), "stationary": ((0.53, 1.06, 1.96), 10.0)}  # times (s), speeds apart (um/s)
 
 
 def read(path):
@@ -48,37 +55,79 @@ def table(folder, every):
     return out
 
 
+def draw_fields(name, folder, out):
+    """Composition above, speed below, at the paper's times or as close to them as there are plotfiles."""
+    times, apart = SHOWN[name]
+    stored = {}
+    for path in find_plotfiles(folder):
+        with Plotfile(path) as plot:
+            stored[plot.time_s] = path
+    chosen = sorted({min(stored, key=lambda t: abs(t - wanted)) for wanted in times})
+    figure, axes = plt.subplots(2, len(chosen), figsize=(3 * len(chosen), 9), squeeze=False, constrained_layout=True,
+                                sharex=True, sharey=True)
+    for column, time in zip(axes.T, chosen):
+        with Plotfile(stored[time]) as plot:
+            level = plot.level_for(1500)
+            phi, (x0, x1, y0, y1) = plot.uniform("phi", level, smooth=True)
+            c = np.where(phi > -0.9, np.nan, plot.uniform("c", level, smooth=True)[0])
+            speed = np.hypot(*(plot.uniform(f"velocity_{a}", level, smooth=True)[0] for a in "xy"))
+        x, y = (a + (np.arange(m) + 0.5) * (b - a) / m for a, b, m in ((x0, x1, phi.shape[1]), (y0, y1, phi.shape[0])))
+        for axis, data, colours, limits, isolines in (
+                (column[0], c, "viridis", (4.0, 4.85), np.arange(4.05, 5, 0.1)),
+                (column[1], speed, "Blues", (0, None), np.arange(apart, speed.max(), apart))):
+            image = axis.imshow(data, origin="lower", extent=(x0, x1, y0, y1), cmap=colours, vmin=limits[0], vmax=limits[1])
+            axis.contour(x, y, data, levels=isolines, colors="white" if axis is column[0] else "tab:red", linewidths=0.5)
+            axis.contour(x, y, phi, levels=[0], colors="k", linewidths=0.8)
+            figure.colorbar(image, ax=axis, shrink=0.7)
+        column[0].set_title(f"{time:.2f} s: c (wt%)", fontsize=10)
+        column[1].set_xlabel("x (µm)")
+        column[1].set_title("speed (µm/s)", fontsize=10)
+    for axis in axes[:, 0]:
+        axis.set_ylabel("y (µm)")
+    figure.savefig(out, dpi=100)
+    plt.close(figure)
+    print(out)
+
+
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--mobile", type=Path)
     parser.add_argument("--stationary", type=Path)
+    parser.add_argument("--diffusion", type=Path)
+    parser.add_argument("--no-solutal", type=Path)
     parser.add_argument("--every", type=float, default=0.01)
     parser.add_argument("--out", type=Path, default=ROOT / "docs/figures/fig1_curves.png")
     args = parser.parse_args()
     figure, axes = plt.subplots(2, 2, figsize=(11, 8), constrained_layout=True)
-    for name, folder, style in (("mobile", args.mobile, "-"), ("stationary", args.stationary, "--")):
+    for name, folder, style in (("fig1_mobile", args.mobile, "-"), ("fig1_stationary", args.stationary, "--"),
+                                ("fig1_diffusion", args.diffusion, ":"), ("fig5_no_solutal", args.no_solutal, "-.")):
         if folder is None:
             continue
-        rows = table(folder, args.every)
-        path = ROOT / f"docs/results/fig1_{name}.csv"
-        with open(path, "w", newline="", encoding="utf-8") as file:
+        rows, case = table(folder, args.every), name.split("_", 1)[1]
+        with open(ROOT / f"docs/results/{name}.csv", "w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, rows[0].keys(), lineterminator="\n")
             writer.writeheader()
             writer.writerows({k: f"{v:.6g}" for k, v in row.items()} for row in rows)
-        t = [r["time_s"] for r in rows]
-        for key, colour in (("down", "tab:red"), ("side", "tab:green"), ("up", "tab:blue")):
-            axes[0, 0].plot(t, [r[f"tip_{key}_um_s"] for r in rows], style, color=colour, label=f"{key}, {name}")
-            axes[0, 1].plot(t, [r[f"arm_{key}_um"] for r in rows], style, color=colour)
-        axes[1, 0].semilogy(t[1:], [r["max_speed_um_s"] for r in rows][1:], style, color="k", label=f"largest, {name}")
-        if name == "mobile":
-            axes[1, 1].plot(t, [r["settling_um_s"] for r in rows], color="k")
-    for axis, label in zip(axes.flat, ("tip speed (µm/s)", "arm (µm)", "speed of the melt (µm/s)", "settling speed (µm/s)")):
+        curve = lambda key: [r[key] for r in rows]
+        t = curve("time_s")
+        if case in SHOWN:
+            draw_fields(case, folder, args.out.with_name(f"{name}.png"))
+            for key, colour in (("down", "tab:red"), ("side", "tab:green"), ("up", "tab:blue")):
+                axes[0, 0].plot(t, curve(f"tip_{key}_um_s"), style, color=colour, label=f"{key}, {case}")
+                axes[0, 1].plot(t, curve(f"arm_{key}_um"), style, color=colour)
+            axes[1, 0].semilogy(t[1:], curve("max_speed_um_s")[1:], style, color="k", label=case)
+        elif case == "diffusion":  # four equal arms
+            axes[0, 0].plot(t, curve("tip_up_um_s"), style, color="k", label=case)
+            axes[0, 1].plot(t, curve("arm_up_um"), style, color="k")
+        if case in ("mobile", "no_solutal"):
+            axes[1, 1].plot(t, curve("settling_um_s"), style, color="k", label=case.replace("no_solutal", "without solutal convection"))
+    for axis, label in zip(axes.flat, ("tip speed (µm/s)", "arm (µm)", "largest speed (µm/s)", "settling speed (µm/s)")):
         axis.set_xlabel("t (s)")
         axis.set_ylabel(label)
         axis.grid(alpha=0.3)
     axes[0, 0].set_ylim(0, 200)
-    axes[0, 0].legend(fontsize=8)
-    axes[1, 0].legend(fontsize=8)
+    for axis in (axes[0, 0], axes[1, 0], axes[1, 1]):
+        axis.legend(fontsize=8)
     figure.savefig(args.out, dpi=110)
     print(args.out)
 

@@ -65,7 +65,7 @@ void FlowOptions::declare(io::Schema& schema) {
   t.choice("buoyancy", buoyancy, {{"mixture", Buoyancy::mixture}, {"liquid", Buoyancy::liquid}})
       .doc("excess of solute inside the interface: c as it is (the print), or of liquid of the same U");
   t.choice("coupling", coupling, {{"coupled", Coupling::coupled}, {"projection", Coupling::projection}})
-      .doc("of velocity and pressure; projection is cheaper a step, and wrong by the splitting");
+      .doc("of velocity and pressure; projection: one after the other, wrong by the splitting and cheaper in no scene that was measured");
   t.integer("projections", projections).range(1, 100).doc("passes of each step with coupling = \"projection\"");
   t.boolean("rotational", rotational).doc("the projection's pressure takes -nu div v as well");
   t.real("tolerance", tolerance).range(1e-12, 0.1).doc("preconditioned residual of a solution over the norm of the velocity; crystals err by some 10 times as much");

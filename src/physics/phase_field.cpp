@@ -22,7 +22,7 @@ void PhaseFieldOptions::declare(io::Schema& schema) {
   t.integer("noise_seed", noise_seed).doc("of the counter-based generator");
   t.real("refine_gradient_W0", refine_gradient_w0)
       .unit("1/W0")
-      .range(1e-4, 0.5)
+      .range(1e-4, 0.2)
       .doc("cells with a larger |grad phi| are kept on the finest level");
   t.integer("buffer_cells", buffer_cells).range(2, 8).doc("cells of the finest level around them, so that no front leaves it between regrids");
 }

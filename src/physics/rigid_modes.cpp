@@ -330,7 +330,8 @@ void RigidModes::prepare(const Momentum& momentum) {
   inverse_.factorize(size_, entries);
 }
 
-void RigidModes::take_from(amr::HierarchyField& r, const Momentum& momentum) {
+// (Z^T K Z)^-1 Z^T r
+std::vector<double> RigidModes::find(const amr::HierarchyField& r) const {
   const amr::Mesh& mesh = hierarchy_->mesh();
   std::vector<std::vector<Coefficients>> parts(at(mesh.size()));
   amr::parallel_for(mesh.size(), [&](int b) {
@@ -349,10 +350,26 @@ void RigidModes::take_from(amr::HierarchyField& r, const Momentum& momentum) {
       const std::size_t crystal = at(neighbourhood_.shares[at(b)][s].crystal);
       for (int k = 0; k < count_[crystal]; ++k) sums[at(first_[crystal] + k)].add(parts[at(b)][s][at(k)]);
     }
-  amounts_ = amr::exact_sums(sums, mesh.comm());
-  for (std::size_t k = 0; k < amounts_.size(); ++k) amounts_[k] *= scale_[k];
-  inverse_.solve(amounts_);
-  for (std::size_t k = 0; k < amounts_.size(); ++k) amounts_[k] *= scale_[k];
+  std::vector<double> amounts = amr::exact_sums(sums, mesh.comm());
+  for (std::size_t k = 0; k < amounts.size(); ++k) amounts[k] *= scale_[k];
+  inverse_.solve(amounts);
+  for (std::size_t k = 0; k < amounts.size(); ++k) amounts[k] *= scale_[k];
+  return amounts;
+}
+
+double RigidModes::fastest_spin(const amr::HierarchyField& r) const {
+  if (empty()) return 0;
+  const std::vector<double> amounts = find(r);
+  double most = 0;
+  for (std::size_t k = 0; k < count_.size(); ++k)
+    for (int turn = 0; turn < TURNS && turn < count_[k]; ++turn)
+      most = std::max(most, std::abs(amounts[at(first_[k] + turn)]) * neighbourhood_.crystals[k].radius);
+  return most;
+}
+
+void RigidModes::take_from(amr::HierarchyField& r, const Momentum& momentum) {
+  const amr::Mesh& mesh = hierarchy_->mesh();
+  amounts_ = find(r);
   amr::parallel_for(mesh.size(), [&](int b) {
     thread_local Scratch v, image;
     v.fit(mesh.layout());

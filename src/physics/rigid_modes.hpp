@@ -27,6 +27,8 @@ class RigidModes {
   /// After build and whenever K has changed. Collective.
   void prepare(const Momentum& momentum);
 
+  /// The largest speed of a crystal's farthest point in Z c, of rotations alone. Collective, the same on any ranks.
+  double fastest_spin(const amr::HierarchyField& r) const;
   /// r -= K Z c. Collective, the same on any ranks.
   void take_from(amr::HierarchyField& r, const Momentum& momentum);
   /// v += Z c, c of the last take_from.
@@ -50,6 +52,7 @@ class RigidModes {
   void curl_of(int b, const Array<const double*>& r, std::vector<double>& curl) const;
   Coefficients products(int b, const Neighbourhood::Share& share, const std::vector<double>& curl) const;
   Coefficients known(std::size_t crystal) const;
+  std::vector<double> find(const amr::HierarchyField& r) const;
 
   const amr::Hierarchy* hierarchy_ = nullptr;
   std::vector<amr::Component> components_;

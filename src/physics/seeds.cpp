@@ -1,5 +1,7 @@
 #include "physics/seeds.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <cmath>
 #include <numbers>
@@ -82,6 +84,8 @@ void SeedOptions::declare(io::Schema& schema, std::vector<SeedOptions>& seeds) {
         t.reals("position_W0", s.position_w0).unit("W0").doc("centre, from the low corner of the box");
         t.real("radius_um", s.radius_um).unit("um").above(0).doc("radius at phi = 0; or radius_W0");
         t.real("radius_W0", s.radius_w0).unit("W0").above(0).doc("radius at phi = 0");
+        t.real("inner_radius_um", s.inner_radius_um).unit("um").above(0).doc("of the hole of a ring (shell); or inner_radius_W0; default: no hole");
+        t.real("inner_radius_W0", s.inner_radius_w0).unit("W0").above(0).doc("of the hole of a ring (shell)");
         t.real("aspect_ratio", s.aspect_ratio)
             .range(0.05, 20)
             .doc("of an ellipse (spheroid): semi-axis along crystal axis 0 over the others; radius is that of the same area (volume)");
@@ -106,6 +110,10 @@ void SeedOptions::declare(io::Schema& schema, std::vector<SeedOptions>& seeds) {
         checks.fail(name, "exactly one of position_um and position_W0", s.position_um ? "both" : "neither");
       if (s.radius_um.has_value() == s.radius_w0.has_value())
         checks.fail(name, "exactly one of radius_um and radius_W0", s.radius_um ? "both" : "neither");
+      if (s.inner_radius_um && s.inner_radius_w0)
+        checks.fail(name, "at most one of inner_radius_um and inner_radius_W0", "both");
+      if ((s.inner_radius_um || s.inner_radius_w0) && s.aspect_ratio != 1)
+        checks.fail(name + ".aspect_ratio", "1, of a ring", fmt::format("{}", s.aspect_ratio));
       if (s.nucleation_time_s && s.nucleation_time_tau0)
         checks.fail(name, "at most one of nucleation_time_s and nucleation_time_tau0", "both");
       if (DIM == 2 && s.euler_deg != std::array<double, 3>{})
@@ -121,6 +129,7 @@ std::vector<Seed> make_seeds(const std::vector<SeedOptions>& options, const Scal
     for (int a = 0; a < DIM; ++a)
       s.position[a] = o.position_w0 ? (*o.position_w0)[a] : (*o.position_um)[a] / scales.w0_um;
     s.radius = o.radius_w0 ? *o.radius_w0 : *o.radius_um / scales.w0_um;
+    s.inner_radius = o.inner_radius_w0 ? *o.inner_radius_w0 : o.inner_radius_um.value_or(0) / scales.w0_um;
     s.aspect_ratio = o.aspect_ratio;
     const Matrix3 about_z = rotation(2, o.angle_deg);
     const Matrix3 m = product(rotation(2, o.euler_deg[0]),
@@ -157,6 +166,7 @@ double Seed::depth(const RealVec& r) const {
     square += r[a] * r[a];
     along += r[a] * axes[0][a];
   }
+  if (inner_radius > 0) return std::min(radius - std::sqrt(square), std::sqrt(square) - inner_radius);
   if (aspect_ratio == 1) return radius - std::sqrt(square);
   constexpr double BULK = 30;  // W0: melt, whatever the exact distance
   if (const double least = std::sqrt(square) - std::max(semi_axes()[0], semi_axes()[1]); least > BULK) return -least;

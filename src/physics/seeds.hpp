@@ -16,7 +16,7 @@ namespace dendrift::physics {
 /// As written in the input; every length in um or in W0.
 struct SeedOptions {
   std::optional<RealVec> position_um, position_w0;
-  std::optional<double> radius_um, radius_w0;
+  std::optional<double> radius_um, radius_w0, inner_radius_um, inner_radius_w0;
   double aspect_ratio = 1;
   double angle_deg = 0;
   std::array<double, 3> euler_deg{};
@@ -30,6 +30,7 @@ struct SeedOptions {
 struct Seed {
   RealVec position{};     ///< of the point where it started, which moves with it, W0
   double radius = 0;      ///< at the start, W0: of the disc (sphere) of the same size
+  double inner_radius = 0;  ///< at the start, W0: of the hole of a ring (shell); 0: none
   double aspect_ratio = 1;  ///< at the start: semi-axis along crystal axis 0 over the others
   Array<RealVec> axes{};  ///< row i: crystal axis i in the frame of the mesh
   bool rotated = false;   ///< axes are not those of the mesh

@@ -97,14 +97,17 @@ TEST(Seeding, SaysWhenThereIsNoRoom) {
   EXPECT_THROW(o.at_random(box(200, false), physics::Scales(physics::AlloyOptions{})), SeedingProblem);
 }
 
-// Places in balls of many sizes, circles and ellipses, some not there: the deepest of all is always listed, and far fewer
+// Places in balls of many sizes, circles, rings and ellipses, some not there: the deepest of all is always listed, and far fewer
 // than all are.
 TEST(Deepest, ListsTheDeepestOfEveryPlaceInABall) {
   constexpr double SIDE = 600;
   for (const bool periodic : {false, true}) {
     const amr::MeshShape shape = box(SIDE, periodic);
     std::vector<SeedOptions> list = options(40).at_random(shape, physics::Scales(physics::AlloyOptions{}));
-    for (std::size_t i = 0; i < list.size(); ++i) list[i].aspect_ratio = i % 3 == 0 ? 1.0 : 0.3 + 0.1 * static_cast<double>(i);
+    for (std::size_t i = 0; i < list.size(); ++i) {
+      list[i].aspect_ratio = i % 3 == 0 ? 1.0 : 0.3 + 0.1 * static_cast<double>(i);
+      if (i % 6 == 0) list[i].inner_radius_w0 = 7;
+    }
     std::vector<physics::Seed> crystals = physics::make_seeds(list, physics::Scales(physics::AlloyOptions{}));
     for (std::size_t i = 0; i < crystals.size(); i += 7) crystals[i].present = false;
     std::mt19937_64 generator(7);
