@@ -186,10 +186,10 @@ nucleation_time_tau0 = 1
 velocity_W0_tau0 = [3, 1, -2]
 """),
     # a crystal that sinks and turns between walls: the flow is solved
-    "3D flow": (dict(lines=0.1, steps=41, omega=0.3), MESH_3D + """
+    "3D flow": (dict(lines=0.1, steps=57, omega=0.3), MESH_3D + """
 [[seed]]
 position_W0 = [26, 32, 40]
-radius_W0 = 5
+radius_W0 = 8
 euler_deg = [10, 30, 50]
 [flow]
 max_interval_tau0 = 0.2
