@@ -27,7 +27,7 @@ class RigidModes {
   /// After build and whenever K has changed. Collective.
   void prepare(const Momentum& momentum);
 
-  /// The largest speed of a crystal's farthest point in Z c, of rotations alone. Collective, the same on any ranks.
+  /// The largest speed of a crystal's farthest point in Z c of forces r, of rotations alone. Collective, the same on any ranks.
   double fastest_spin(const amr::HierarchyField& r) const;
   /// r -= K Z c. Collective, the same on any ranks.
   void take_from(amr::HierarchyField& r, const Momentum& momentum);
