@@ -39,9 +39,11 @@ def table(folder, every):
         tips.setdefault(round(row["time_s"], 9), {})[round(row["euler_deg"] / 90) * 90, row["x_um"] > 428.7] = row
     for row in read(folder / "grains.csv"):
         grains[round(row["time_s"], 9)] = row
-    out = []
+    out, aside, spin = [], 0.0, 0.0  # the most since the last line
     for row in read(folder / "diagnostics.csv"):
         t = round(row["time_s"], 9)
+        if t in grains:
+            aside, spin = max(aside, grains[t]["vx_um_s"], key=abs), max(spin, grains[t]["omega_rad_s"], key=abs)
         if abs(t / every - round(t / every)) > 1e-6 or t not in grains:
             continue
         at = tips.get(t, {})
@@ -51,6 +53,8 @@ def table(folder, every):
         for name, angle in (("down", 0), ("side", 90), ("up", 180)):
             line[f"tip_{name}_um_s"] = pick(angle)["speed_um_s"] if pick(angle) else float("nan")
             line[f"arm_{name}_um"] = (abs(pick(angle)["y_um"] - grains[t]["y_um"]) if angle != 90 else abs(pick(angle)["x_um"] - grains[t]["x_um"])) if pick(angle) else float("nan")
+        line.update(aside_um_s=aside, omega_rad_s=spin, x_um=grains[t]["x_um"], angle_rad=grains[t]["angle_rad"])
+        aside = spin = 0.0
         out.append(line)
     return out
 

@@ -314,10 +314,10 @@ def disc():
 class FlowRun:
     """One run of an input whose W0 is 1 um and tau0 1 s, so that the files are in W0 and tau0."""
 
-    def __init__(self, name, *overrides, ranks=None):
+    def __init__(self, name, *overrides, ranks=None, build=None):
         folder = tempfile.mkdtemp(prefix="dendrift_verify_") if not ARGS.keep else os.path.join("out", "verify")
         self.dir = os.path.join(folder, "run")
-        command = ["mpirun", "--oversubscribe", "-n", str(ranks or ARGS.ranks), os.path.join(ARGS.build, "dendrift"),
+        command = ["mpirun", "--oversubscribe", "-n", str(ranks or ARGS.ranks), os.path.join(build or ARGS.build, "dendrift"),
                    os.path.join(ROOT, "inputs", "verification", name), f"output.dir={self.dir}", *overrides]
         done = subprocess.run(command, capture_output=True, text=True)
         if done.returncode != 0:
@@ -325,6 +325,7 @@ class FlowRun:
         read = lambda file: [{k: float(v) for k, v in row.items()} for row in csv.DictReader(open(os.path.join(self.dir, file)))]
         self.diagnostics, self.grains = read("diagnostics.csv"), read("grains.csv")
         manifest = json.load(open(os.path.join(self.dir, "manifest.json")))
+        self.commit = manifest["git_hash"][:7]
         self.wall, self.flow_s = manifest["wall_s"], manifest["wall_by_phase"]["flow"]["seconds"]
         self.iterations = int(max(d["flow_iterations"] for d in self.diagnostics))
 
@@ -468,6 +469,27 @@ def flow_steps():
                      "fallen_error_percent": percent(g["y_um"] - r.grains[0]["y_um"], exact["y_um"] - r.grains[0]["y_um"]),
                      "flow_s": r.flow_s, "flow_over_rest": r.flow_s / (r.wall - r.flow_s), "wall_s": r.wall})
     write("flow_steps", rows)
+
+
+@case
+def kicks():
+    """fig1_mobile for .02 s from --checkpoint: speed aside and spin of a crystal that should sink straight, at two tolerances."""
+    if ARGS.checkpoint is None:
+        print("kicks: needs --checkpoint FILE of inputs/paper/fig1_mobile.toml (output.keep_checkpoints=100 keeps them all)")
+        return
+    import h5py
+    with h5py.File(ARGS.checkpoint) as file:
+        begin = int(file.attrs["step"])
+    rows = []
+    for build, tolerance in ((ARGS.build, 2e-6), (ARGS.build, 1e-7)) + (((ARGS.other_build, 2e-6),) if ARGS.other_build else ()):
+        r = FlowRun("../paper/fig1_mobile.toml", "--restart", ARGS.checkpoint, "--allow-changes", f"run.max_steps={begin + 820}",
+                    "output.plot_every_s=1", "output.checkpoint_every_s=1", f"flow.tolerance={tolerance}", build=build)
+        aside, spin = ([g[k] for g in r.grains] for k in ("vx_um_s", "omega_rad_s"))
+        counts = [d["flow_iterations"] for d in r.diagnostics]
+        rows.append({"program": r.commit, "tolerance": f"{tolerance:.0e}", "from_s": r.grains[0]["time_s"], "to_s": r.grains[-1]["time_s"],
+                     "aside_least_um_s": min(aside), "aside_most_um_s": max(aside), "spin_least_rad_s": min(spin),
+                     "spin_most_rad_s": max(spin), "iterations": sum(counts) / len(counts)})
+    write("kicks", rows)
 
 
 @case
@@ -788,6 +810,8 @@ def main():
     parser.add_argument("cases", nargs="*", metavar="CASE")
     parser.add_argument("--build", default=os.path.join(ROOT, "build", "release"))
     parser.add_argument("--ranks", type=int, default=1)
+    parser.add_argument("--checkpoint", metavar="FILE", help="where kicks begins")
+    parser.add_argument("--other-build", metavar="DIR", help="kicks: a build of another commit beside this one")
     parser.add_argument("--keep", action="store_true", help="leave the last run in out/verify")
     ARGS = parser.parse_args()
     if not ARGS.cases:
