@@ -89,6 +89,11 @@ def flow_steps(r):
     return [r["way"], num(r["error_percent"], 3) + " %", num(r["fallen_error_percent"], 3) + " %", num(r["flow_over_rest"], 2)]
 
 
+def kicks(r):
+    return [r["program"], r["tolerance"], *(num(r[f"aside_{k}_um_s"], 3) for k in ("least", "most")),
+            *(num(r[f"spin_{k}_rad_s"], 4) for k in ("least", "most")), num(r["iterations"], 1)]
+
+
 def width_rows():
     table = rows("width")
     base = next(float(r["tip_um"]) for r in table if r["W0_over_d0"] == "10" and r["dx_W0"] == "0.8")
@@ -120,6 +125,7 @@ TABLES = {
     "offsets": lambda: map(lambda r: [r["law"], r["R_W0"], r["ratio"], num(r["offset_W0"], 3), r["reference"],
                                       f"{float(r['nonrigidity']):.1e}"], rows("offsets")),
     "splitting": lambda: map(splitting, rows("splitting")), "flow_steps": lambda: map(flow_steps, rows("flow_steps")),
+    "kicks": lambda: map(kicks, rows("kicks")),
     "rising": lambda: map(lambda r: [r["tolerance"], num(r["rising"], 7), num(r["falling"], 7), num(r["difference_percent"], 4) + " %"], rows("rising")),
     "turned": lambda: map(lambda r: [r["dx_W0"], *(num(r[k + "_percent"], 3) + " %" for k in ("arms_differ", "length", "speed", "radius")),
                                      f"{float(r['drift']):.0e}"], rows("turned")),
