@@ -24,17 +24,23 @@ def case(f):
     return f
 
 
+def dendrift(name, overrides, ranks=None, build=None):
+    """Runs an input of inputs/verification; the folder of what it wrote."""
+    folder = tempfile.mkdtemp(prefix="dendrift_verify_") if not ARGS.keep else os.path.join("out", "verify")
+    out = os.path.join(folder, "run")
+    command = ["mpirun", "--oversubscribe", "-n", str(ranks or ARGS.ranks), os.path.join(build or ARGS.build, "dendrift"),
+               os.path.join(ROOT, "inputs", "verification", name), f"output.dir={out}", *overrides]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode != 0:
+        sys.exit(f"{' '.join(command)}\nended with {done.returncode}:\n{done.stdout[-2000:]}{done.stderr[-3000:]}")
+    return out
+
+
 class Run:
     """One run of dendrift; tips by arm and time, diagnostics by time."""
 
     def __init__(self, name, *overrides, ranks=None):
-        folder = tempfile.mkdtemp(prefix="dendrift_verify_") if not ARGS.keep else os.path.join("out", "verify")
-        self.dir = os.path.join(folder, "run")
-        command = ["mpirun", "--oversubscribe", "-n", str(ranks or ARGS.ranks), os.path.join(ARGS.build, "dendrift"),
-                   os.path.join(ROOT, "inputs", "verification", name), f"output.dir={self.dir}", *overrides]
-        done = subprocess.run(command, capture_output=True, text=True)
-        if done.returncode != 0:
-            sys.exit(f"{' '.join(command)}\nended with {done.returncode}:\n{done.stdout[-2000:]}{done.stderr[-3000:]}")
+        self.dir = dendrift(name, overrides, ranks)
         check = subprocess.run([os.path.join(ARGS.build, "dendrift"), os.path.join(ROOT, "inputs", "verification", name),
                                 *overrides, "run.max_steps=1", "--check"], capture_output=True, text=True).stdout
         self.scale = {line.split()[0]: float(line.split()[1]) for line in check.splitlines()
@@ -315,13 +321,7 @@ class FlowRun:
     """One run of an input whose W0 is 1 um and tau0 1 s, so that the files are in W0 and tau0."""
 
     def __init__(self, name, *overrides, ranks=None, build=None):
-        folder = tempfile.mkdtemp(prefix="dendrift_verify_") if not ARGS.keep else os.path.join("out", "verify")
-        self.dir = os.path.join(folder, "run")
-        command = ["mpirun", "--oversubscribe", "-n", str(ranks or ARGS.ranks), os.path.join(build or ARGS.build, "dendrift"),
-                   os.path.join(ROOT, "inputs", "verification", name), f"output.dir={self.dir}", *overrides]
-        done = subprocess.run(command, capture_output=True, text=True)
-        if done.returncode != 0:
-            sys.exit(f"{' '.join(command)}\nended with {done.returncode}:\n{done.stdout[-2000:]}{done.stderr[-3000:]}")
+        self.dir = dendrift(name, overrides, ranks, build)
         read = lambda file: [{k: float(v) for k, v in row.items()} for row in csv.DictReader(open(os.path.join(self.dir, file)))]
         self.diagnostics, self.grains = read("diagnostics.csv"), read("grains.csv")
         manifest = json.load(open(os.path.join(self.dir, "manifest.json")))
